@@ -62,11 +62,13 @@ class Physique:
         mass_index: body mass index at rest, of a body as dense as water [kg/m2].
         average: that of the model's average body [kg/m2].
         female: share from 0, male, to 1, female [-].
+        height: how tall the person stands [m]; None: not known.
     """
 
     mass_index: float
     average: float
     female: float
+    height: float | None = None
 
     @property
     def heavier(self) -> float:
@@ -142,8 +144,8 @@ class Body:
         from stmpl_core.anny_model import posed
 
         vertices, faces, *_ = at_rest = posed({}, phenotype)
-        average = mass_index(_average().vertices, _average().faces)
-        physique = Physique(mass_index(vertices, faces), average, float(phenotype.get("gender", AVERAGE)))
+        average, height = mass_index(_average().vertices, _average().faces), float(np.ptp(vertices[:, 2]))
+        physique = Physique(mass_index(vertices, faces), average, float(phenotype.get("gender", AVERAGE)), height)
         return cls("anny", *(posed(turns, phenotype) if turns else at_rest), physique)
 
     @classmethod
@@ -201,7 +203,8 @@ class Body:
         bones = JOINT_NAMES if model_type == "smplx" else SMPLH_JOINT_NAMES
         if model_type == "smpl":
             bones = [*bones[:22], "left_hand", "right_hand"]
-        physique = Physique(mass_index(own, faces), mass_index(mean, faces), SEXES.get(gender, AVERAGE))
+        physique = Physique(mass_index(own, faces), mass_index(mean, faces), SEXES.get(gender, AVERAGE),
+                            float(np.ptp(own[:, 2])))  # fmt: skip
         bones = tuple(bones[: weights.shape[1]])
         return cls(model_type, posed, faces, _smpl_uv(uv, faces), weights, bones, physique)
 

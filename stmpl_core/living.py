@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -16,7 +17,7 @@ from stmpl_core.body import AROUND, Body
 from stmpl_core.bones import Bone, bones_of, to_bone
 from stmpl_core.bony import bony
 from stmpl_core.errors import InvalidInput
-from stmpl_core.fat import fat_map, for_person
+from stmpl_core.fat import fat_map, for_person, unmeasured
 from stmpl_core.friction import Friction
 from stmpl_core.layer import MAX_THICKNESS, SoftLayer, one_thickness
 from stmpl_core.limbs import EDGE_LENGTH
@@ -25,6 +26,8 @@ from stmpl_core.regions import HELD_SKIN, Tone, region
 from stmpl_core.text_file import text_of
 from stmpl_core.tissue import Tissue
 from stmpl_core.trunk import TRUNK
+
+log = logging.getLogger(__name__)
 
 STRAIGHT = ("torso", "back")  # parts whose bones are not known: their tissue lies straight below the skin
 SHEET = 2e-3  # thickness with which a part is meshed before its columns are known [m]
@@ -39,7 +42,8 @@ def living(body: Body, part: str, tone: Tone = "relaxed", *, edge_length: float 
 
     Arms and legs reach to their bones, so how thick their tissue is follows the body. Torso and back are as thick as
     their region; abdomen, neck and shoulders no thicker than theirs, in columns to spine or humerus. Fat and skin
-    follow the person's weight and sex, fat also the side of a limb (stmpl_core.fat).
+    follow the person's weight and sex, fat also the side of a limb (stmpl_core.fat). The log tells of a person unlike
+    those who were measured: a child, or one much lighter or heavier.
 
     Args:
         body: body.
@@ -93,6 +97,8 @@ def filled(body: Body, part: str, lay: Callable[..., SoftLayer], tone: Tone = "r
         tone: state of the muscle.
     """
     skin = None if part in STRAIGHT else lay(thickness=SHEET)  # refuses a part that is none
+    if why := unmeasured(body.physique):
+        log.warning("skin, fat and muscle of %s may be wrong: %s", part, why)
     its = for_person(region(part, tone), body.physique)
     if skin is None:
         return lay(thickness=its.thickness, tissue=its.tissue)

@@ -1,5 +1,7 @@
 """Laws of fat and skin that follow a person and a place, and of materials that begin as deep as a vertex says."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ from fem_tools.plies import wedge_ends, wedge_materials
 from stmpl_core import Load, Membrane, Ply, Simulator, SoftLayer, Tissue
 from stmpl_core.body import Body, Physique, mass_index
 from stmpl_core.errors import InvalidInput
-from stmpl_core.fat import SITES, fat_factor, fat_map, for_person
+from stmpl_core.fat import SITES, fat_factor, fat_map, for_person, unmeasured
 from stmpl_core.layer import layer_id
 from stmpl_core.living import living
 from stmpl_core.methods import MomentNet
@@ -42,6 +44,21 @@ def test_weight_and_sex_matter_as_much_as_in_388_others(name, per_ten, sexes):
     ten = fat_factor(name, Physique(34, 24, 0.5)) - 1
     assert 0.5 * per_ten < ten < 2 * per_ten
     assert 0.5 * sexes < fat_factor(name, WOMAN) / fat_factor(name, MAN) - 1 < 3 * sexes
+
+
+def test_a_child_and_a_mass_index_that_nobody_had_are_told_of():
+    assert not any(unmeasured(one) for one in (None, WOMAN, MAN, HEAVY, LIGHT, Physique(17, 19, 0.5, 1.8)))
+    assert "1.23 m tall" in unmeasured(Physique(15.6, 19.4, 0.5, 1.23)) and "16 kg/m2" in unmeasured(Physique(16, 24, 0))
+    assert "46 kg/m2" in unmeasured(Physique(46, 24, 1, 1.7))
+
+
+def test_the_log_tells_of_a_child_whose_limb_is_made(caplog):
+    adult = Body.anny()
+    living(adult, "left_forearm", edge_length=COARSE)
+    assert "measured" not in caplog.text
+    child = replace(adult, vertices=0.6 * adult.vertices, physique=Physique(19.4, 19.4, 0.5, 0.98))
+    living(child, "left_forearm", edge_length=COARSE)
+    assert "of left_forearm may be wrong: the person is 0.98 m tall" in caplog.text
 
 
 def test_sites_are_ordered_as_measured():
