@@ -331,7 +331,7 @@ def _look_on_stack(points, inward, thickness, area, strain, corners, shares, sin
     given_way, among = _given_way(matrix, wide, force, near, of), _among(points, inward, thickness, group, t, force)
     shape = _shape(*among, force)
     seen = _see_on_stack(moments[0], vectors[0], inward, thickness, area, t, times * force, strain, sinking, here, nu,
-                         numbers, log_thickness, hardening, _between(corners, shares, alike)[:, 0],
+                         numbers, log_thickness, hardening, _between(corners, shares, alike),
                          given_way, shape)  # fmt: skip
     powers = powers_of(matrix, force, depth, of, len(near))
     return *seen, powers, missed, matrix, rings, force, times, over, given_way, *among
@@ -349,16 +349,18 @@ def _see_on_stack(moments, vectors, inward, thickness, area, t, force, strain, s
         row[:SEEN_ALIKE] = alike[n, :SEEN_ALIKE]
         row[ON_STACK.log_thickness], row[ON_STACK.column_strain] = np.log(thickness[n] / t), strain[n]
         row[ON_STACK.log_kappa], row[ON_STACK.log_pull] = numbers[1], numbers[2]
-        row[ON_STACK.hardening] = _hardening(log_thickness, hardening, alike_at[n], sinking[n] / thickness[n])
+        as_thick = alike_at[n, 0]
+        row[ON_STACK.hardening] = _hardening(log_thickness, hardening, as_thick, sinking[n] / thickness[n])
         row[ON_STACK.curvature] = alike[n, AT.mean_curvature]
         row[ON_STACK.curvature_over_strain] = alike[n, AT.mean_curvature] / (overlap[n] + ROUND_FROM)
         row[ON_STACK.given_way] = given_way[n]
         row[ON_STACK.turned], row[ON_STACK.uneven] = shape[n]
+        row[ON_STACK.stiffening], row[ON_STACK.stiffening + 1] = alike_at[n, 1], alike_at[n, 2]
         solved = min(strain[n], STACK_LINEAR_TO)
-        top = _hardening(log_thickness, hardening, alike_at[n], solved)
+        top = _hardening(log_thickness, hardening, as_thick, solved)
         pressure[n] *= np.exp(_share(solved, row[ON_STACK.curvature]) * top)
         if strain[n] > solved:
-            there = _hardening(log_thickness, hardening, alike_at[n], strain[n])
+            there = _hardening(log_thickness, hardening, as_thick, strain[n])
             pressure[n] *= (strain[n] / solved * np.exp(there - top)) ** HARDENING
     return pressure, inputs, _faded(overlap, moments, STACK_FADE)
 
@@ -510,7 +512,7 @@ def _slopes_on_stack(points, inward, thickness, area, strain, corners, shares, s
     """See ContactNet.slopes; sunk: what `nearer` gives."""
     here = _between(corners, shares, bent)
     rates = rates_of(matrix, force, _reached(sinking, strain, sinking_rates, strain_rates, STACK_LINEAR_TO) - sunk)
-    alike_at = _between(corners, shares, alike)[:, 0]
+    alike_at = _between(corners, shares, alike)
     steps = _steps(force, rates, strain, strain_rates)
     forces, strains = _stepped(force, rates, steps, 0.0), _stepped(strain, strain_rates, steps, 1e-9)
     depths = _stepped(sinking, sinking_rates, steps, 0.0)

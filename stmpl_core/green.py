@@ -36,7 +36,7 @@ from stmpl_core.nodewise import FIRST_LOG, REACH, SPREADS, STEP_LOG, Packed
 from stmpl_core.obstacle import columns_of
 from stmpl_core.response import FAST, SPREAD
 from stmpl_core.softness import BANK, Softness
-from stmpl_core.stack import Effective, along, compliance, effective, hardening
+from stmpl_core.stack import Effective, along, compliance, effective, hardening, stiffening
 from stmpl_core.tissue import Tissue
 from stmpl_core.twins import NO_TWINS, Twins, give_way
 
@@ -254,13 +254,14 @@ class Green:
         Returns:
             logs: logarithms of thicknesses, (T,).
             table: stmpl_core.stack.hardening there, at even strains from 0 to below 1, (T, S).
-            alike: thickness of the column that each vertex' hardens as, (V, 1) [m].
+            alike: thickness of the column that each vertex' hardens as [m], its stmpl_core.stack.stiffening, (V, 3).
         """
         layer = self.layer
         alike = layer.thickness if layer.ply_scale is None else layer.thickness / layer.ply_scale
         logs = np.linspace(np.log(alike.min()), np.log(alike.max()) + 1e-6, COLUMNS)
         strain = np.linspace(0, 1, STRAINS, endpoint=False)
-        return logs, np.array([hardening(layer.tissue, t, strain) for t in np.exp(logs)]), alike[:, None]
+        return (logs, np.array([hardening(layer.tissue, t, strain) for t in np.exp(logs)]),
+                np.column_stack([alike, stiffening(layer.tissue, alike)]))  # fmt: skip
 
     def matrix(self, nodes: Nodes, group: np.ndarray) -> np.ndarray:
         """Depth at each node under a force E at each along the normals, symmetric, (N, N) [1/m]; see `matrices`."""

@@ -133,6 +133,7 @@ STACK_NODE = Layout(
     given_way=1,  # share of the linear work that goes into the limb as a whole, its coarse part
     turned=1,  # log of how far normals turn from each other where it presses around the node
     uneven=1,  # how uneven the tissue's thickness is there
+    stiffening=2,  # of the column there, see stmpl_core.stack.stiffening
 )
 
 ON_STACK = {
@@ -142,6 +143,7 @@ ON_STACK = {
     "log_pull": 1,
     "log_softness": 1,
     "log_sunk": 1,  # largest linear motion, over the flat stack's thickness
+    "stiffening": 2,  # of the column at the vertex, see stmpl_core.stack.stiffening
 }
 STACK_POINT, STACK_INPUTS = Layout(**POINT.sizes, **ON_STACK), Layout(**INPUTS.sizes, **ON_STACK)
 

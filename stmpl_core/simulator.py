@@ -33,7 +33,7 @@ from stmpl_core.trust import Displacement, Trust
 from stmpl_core.twins import going_together
 from stmpl_core.wake import sunk
 
-LEAST_HELD = 0.02  # motion that is held back, over the peak, from which it is said
+LEAST_HELD = 0.08  # motion that is held back, over the peak, from which it is said: less is within the stated bound
 MOST_MOVED = 0.95  # motion over the thickness from which it is held back
 ELSEWHERE = 1e-3  # distance of a touch's skin from where it is now, over the thickness, from which it is another's
 FEW_NODES, MANY_NODES = 160, 240  # nodes up to which skin goes with its tools node by node, and from which by vertices
@@ -206,7 +206,8 @@ class Simulator:
             trust = trust.also(f"skin is {fitted.entered * 1e3:.2f} mm inside a tool", in_range=False)
         displacement, peak, cut = _within(fitted.displacement, self.layer.thickness)
         if cut:
-            trust = trust.also(f"{cut} vertices would move further than there is skin: held back", in_range=False)
+            trust = trust.also(f"skin would move further than there is any at {cut} of its vertices: held back there",
+                               in_range=False)  # fmt: skip
         if trust.in_range:
             known = getattr(self.method, "contact_bound" if by_vertices else "stick_bound", None)
             bound = motion_bound(known, touches, moves, peak, left)

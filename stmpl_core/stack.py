@@ -247,6 +247,26 @@ def hardening(tissue: Tissue, thickness: float, strain: ArrayLike) -> np.ndarray
     return np.interp(np.asarray(strain, dtype=float), whole, logs)
 
 
+def stiffening(tissue: Tissue, thickness: ArrayLike) -> np.ndarray:
+    """How much stiffer columns are below their first material: moments over depth of log(E / E of the first), (V, 2).
+
+    The mean, and the mean weighed with 2 z - 1 at the depth z over the thickness: how much of it lies deep. Both are 0
+    of one material.
+
+    Args:
+        tissue: materials.
+        thickness: thickness of each column, (V,) [m], > 0.
+    """
+    thickness = np.asarray(thickness, dtype=float)
+    out = np.zeros((len(thickness), 2))
+    for k, ply in enumerate(tissue.deeper):
+        end = tissue.deeper[k + 1].depth if k + 1 < len(tissue.deeper) else np.inf
+        a, b = np.minimum(ply.depth / thickness, 1), np.minimum(end / thickness, 1)
+        more = np.log(ply.youngs_modulus / tissue.youngs_modulus)
+        out += more * np.column_stack([b - a, (b - a) * (a + b - 1)])
+    return out
+
+
 def effective(tissue: Tissue, thickness: float, radii: Iterable[float] = RADII) -> Effective:
     """The single layer under the same skin that answers most like the stack, fitted to all loads at once.
 

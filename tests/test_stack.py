@@ -7,7 +7,7 @@ import pytest
 
 from stmpl_core import Membrane, Ply, Tissue
 from stmpl_core.errors import InvalidInput
-from stmpl_core.stack import along, ball, ball_force, compliance, effective
+from stmpl_core.stack import along, ball, ball_force, compliance, effective, stiffening
 
 K = np.geomspace(0.02, 400, 300)
 SKIN = Membrane(2e5, 1.5e-3, 20.0)
@@ -143,6 +143,22 @@ def test_the_nearest_layer_of_a_stack_lies_between_its_materials():
     found = effective(LIMB, 0.04)
     assert 3e3 < found.youngs_modulus < 1e4 and 0.01 < found.thickness < 0.04
     assert max(found.misfit) < 0.1 < min(found.bare)
+
+
+def test_how_much_stiffer_a_column_is_below_is_none_of_one_material_and_fades_as_the_second_leaves_it():
+    columns = np.array([0.02, 0.03])
+    assert not stiffening(Tissue(3e3, 0.45, skin=SKIN), columns).any()
+    assert not stiffening(Tissue(3e3, 0.45, deeper=(Ply(5e-3, 3e3), Ply(3e-2, 9e3))), columns).any()
+    far, near = stiffening(Tissue(3e3, 0.45, deeper=(Ply(1e-2, 9e3),)), [0.02, 0.01 + 1e-9])
+    assert far == pytest.approx([0.5 * np.log(3), 0.25 * np.log(3)])  # z from 1/2 to 1: its share, and that by 2 z - 1
+    assert near == pytest.approx([0, 0], abs=1e-6)
+
+
+def test_how_much_stiffer_a_column_is_below_is_the_mean_of_its_depths():
+    stack, t = Tissue(2e3, 0.45, deeper=(Ply(4e-3, 1e3), Ply(1.1e-2, 3e4))), 0.025
+    z = (np.arange(100_000) + 0.5) / 100_000
+    more = np.log(np.select([z * t < 4e-3, z * t < 1.1e-2], [1.0, 0.5], 15.0))
+    assert stiffening(stack, [t])[0] == pytest.approx([more.mean(), (more * (2 * z - 1)).mean()], abs=1e-4)
 
 
 def test_a_ball_on_deep_tissue_is_held_as_hertz_says():

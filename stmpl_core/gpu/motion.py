@@ -395,6 +395,8 @@ def move(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, skins:
                     inputs[MORE + 3] = wp.float32(one.log_pull)
                     inputs[MORE + 4] = wp.float32(wp.log(one.softness))
                     inputs[MORE + 5] = wp.float32(wp.log(field.peak[f] / one.flat + real(1e-6)))
+                    inputs[MORE + 6] = wp.float32(skins.alike[v][1])
+                    inputs[MORE + 7] = wp.float32(skins.alike[v][2])
                 out = _think(inputs, net)
                 x, y = out[OUT_SLOPE] * slope_x, out[OUT_SLOPE] * slope_y
                 for m in range(WAYS):

@@ -103,7 +103,7 @@ SKINS: dict[str, tuple[Any, str]] = {
     "corners": (wp.vec3d, "Gx"), "corner_many": (wp.int32, "G"),
     "looked_at": (vec3, "Kx"), "look_many": (wp.int32, "Kx"),
     "rows": (real, "Tx"), "linked": (wp.uint32, "Vb"),
-    "green": (real, "SbgR"), "soft": (real, "V"), "alike": (real, "V"), "coarse_corner": (wp.vec3i, "V"),
+    "green": (real, "SbgR"), "soft": (real, "V"), "alike": (vec3, "V"), "coarse_corner": (wp.vec3i, "V"),
     "coarse_share": (vec3, "V"),
     "gathered": (real, "c"), "motion": (wp.float32, "m"), "hard_logs": (real, "St"), "hard": (real, "Sts"),
 }  # fmt: skip
@@ -298,7 +298,7 @@ def _of_stack(one: Any, skin: Skin, order: np.ndarray, at: tuple[int, int]) -> d
     one.first_coarse, one.first_motion = at
     out: dict[str, np.ndarray] = {
         "linked": _linked(skin, order) if skin.near.folded else np.zeros((len(order), 1), np.uint32),
-        "green": np.zeros((1, 1, 1, 1)), "soft": np.zeros(len(order)), "alike": np.zeros(len(order)),
+        "green": np.zeros((1, 1, 1, 1)), "soft": np.zeros(len(order)), "alike": np.zeros((len(order), 3)),
         "coarse_corner": np.zeros((1, 3), int),
         "coarse_share": np.zeros((1, 3)), "gathered": np.zeros(0), "motion": np.zeros(0),
         "hard_logs": np.zeros((1, COLUMNS)), "hard": np.zeros((1, COLUMNS, STRAINS)),
@@ -314,7 +314,7 @@ def _of_stack(one: Any, skin: Skin, order: np.ndarray, at: tuple[int, int]) -> d
     _, one.log_kappa, one.log_pull, log_softness = (float(x) for x in green.numbers)
     one.softness = float(np.exp(log_softness))
     return out | {
-        "green": green.tables[None, :, 0], "soft": green.soft[order], "alike": alike[order, 0],
+        "green": green.tables[None, :, 0], "soft": green.soft[order], "alike": alike[order],
         "coarse_corner": corners[order], "coarse_share": shares[order], "gathered": gathered, "motion": motion.ravel(),
         "hard_logs": logs[None], "hard": hard[None],
     }  # fmt: skip

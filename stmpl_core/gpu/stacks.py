@@ -47,6 +47,7 @@ AT_HARDENING, AT_KAPPA = wp.constant(STACK_NODE.at.hardening), wp.constant(STACK
 AT_PULL, AT_CURVATURE = wp.constant(STACK_NODE.at.log_pull), wp.constant(STACK_NODE.at.curvature)
 AT_OVER, AT_GIVEN = wp.constant(STACK_NODE.at.curvature_over_strain), wp.constant(STACK_NODE.at.given_way)
 AT_TURNED, AT_UNEVEN = wp.constant(STACK_NODE.at.turned), wp.constant(STACK_NODE.at.uneven)
+AT_STIFFENING = wp.constant(STACK_NODE.at.stiffening)
 AMONG, TURNED_FROM = wp.constant(wp.float64(contact_net.AMONG)), wp.constant(wp.float64(contact_net.TURNED_FROM))
 assert math.isclose(green.SPREADS[0], math.exp(green.FIRST_LOG))
 wp.set_module_options({**OPTIONS, "max_unroll": 4})
@@ -415,11 +416,12 @@ def see(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
         pressure, overlap = one.softness * linear, scratch.sinking[s, i] / t
         _write_alike(scratch, s, i, pressure, overlap, moments, strains, pull, sunk)
         corners, shares, curvature = skins.faces[scratch.face[s, i]], scratch.shares[s, i], real(0.0)
-        alike = real(0.0)
+        column = vec3()
         for n in range(3):
             v = corners[n]
-            alike += shares[n] * skins.alike[v]
+            column = column + shares[n] * skins.alike[v]
             curvature += real(0.5) * shares[n] * (skins.bent[v, 0] + skins.bent[v, 4] + skins.bent[v, 8])
+        alike = column[0]
         _write(scratch, s, i, AT_THICKNESS, wp.log(thick / t))
         _write(scratch, s, i, AT_COLUMN, strain)
         _write(scratch, s, i, AT_HARDENING, _hardening(skins, id, alike, scratch.sinking[s, i] / thick))
@@ -434,6 +436,8 @@ def see(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
             uneven = wp.sqrt(wp.max(logs[1] / weights - mean * mean, real(0.0)))
         _write(scratch, s, i, AT_TURNED, wp.log(turned + TURNED_FROM))
         _write(scratch, s, i, AT_UNEVEN, uneven)
+        _write(scratch, s, i, AT_STIFFENING, column[1])
+        _write(scratch, s, i, AT_STIFFENING + 1, column[2])
         solved = wp.min(strain, STACK_LINEAR_TO)
         top = _hardening(skins, id, alike, solved)
         share = (real(1.0) - DEEP_GIVES * solved) * (real(1.0) - ROUND_GIVES * wp.clamp(curvature, real(0.0), ROUNDEST))

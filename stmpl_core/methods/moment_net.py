@@ -278,12 +278,13 @@ def of_stack(green: Green, vertices: np.ndarray, peak: float) -> np.ndarray:
     """What the network reads of a stack at vertices (N,) under the peak of the linear motion [m]; see ON_STACK.
 
     Returns:
-        (N, 6) float32.
+        (N, 8) float32.
     """
-    out = np.empty((len(vertices), 6), np.float32)
+    out = np.empty((len(vertices), 8), np.float32)
     out[:, 0] = np.log(green.layer.thickness[vertices] / green.thickness)
     out[:, 1:5] = green.numbers
     out[:, 5] = np.log(peak / green.thickness + 1e-6)
+    out[:, 6:] = green.hardening[2][vertices, 1:]
     return out
 
 
