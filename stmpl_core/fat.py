@@ -21,9 +21,9 @@ from stmpl_core.bones import SEGMENTS, across, bones_of
 from stmpl_core.regions import Quantity, Region, region
 
 MULTIS = "MULTIS, Neumann et al., Sci Data 5 (2018) 180193: 95 adults, ultrasound, geometric mean and deviation"
-MEASURED = 17.0, 45.0  # body mass indices of those people, whose mean is AVERAGE [kg/m2]
-AVERAGE = 24.0  # body mass index at which the fits below are [kg/m2]
-SHORTEST = 1.4  # height below which a person is hardly an adult [m]
+MEASURED = 17.0, 45.0  # body mass indices of those people [kg/m2]
+AVERAGE = 24.0  # body mass index at which the fits below are, taken for that of a model's average body [kg/m2]
+SHORTEST = 1.4  # height below which a person is a child, or shorter than nearly all adults [m]
 LEAST_FAT = 1e-3  # thinnest fat [m]; the thinnest of MULTIS is 0.6 mm
 NEAREST = 4  # vertices of the body from which a place of a part learns what side it is on
 
@@ -83,10 +83,10 @@ def unmeasured(physique: Physique | None) -> str:
     if physique is None:
         return ""
     if physique.height is not None and physique.height < SHORTEST:
-        return f"the person is {physique.height:.2f} m tall, and only adults were measured"
+        return f"the person is {physique.height:.2f} m tall, and adults were measured, hardly one below {SHORTEST:g} m"
     if not MEASURED[0] <= (mass_index := AVERAGE + physique.heavier) <= MEASURED[1]:
-        return (f"the person has {mass_index:.0f} kg/m2, and people of {MEASURED[0]:.0f} to {MEASURED[1]:.0f} were "
-                "measured")  # fmt: skip
+        return (f"the person is as heavy as people of {mass_index:.1f} kg/m2, and people of {MEASURED[0]:.0f} to "
+                f"{MEASURED[1]:.0f} were measured")  # fmt: skip
     return ""
 
 

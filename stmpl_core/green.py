@@ -254,7 +254,7 @@ class Green:
         Returns:
             logs: logarithms of thicknesses, (T,).
             table: stmpl_core.stack.hardening there, at even strains from 0 to below 1, (T, S).
-            alike: thickness of the column that each vertex' hardens as [m], its stmpl_core.stack.stiffening, (V, 3).
+            alike: thickness of the column that each vertex' hardens as [m], and stmpl_core.stack.stiffening, (V, 3).
         """
         layer = self.layer
         alike = layer.thickness if layer.ply_scale is None else layer.thickness / layer.ply_scale

@@ -43,7 +43,7 @@ def living(body: Body, part: str, tone: Tone = "relaxed", *, edge_length: float 
     Arms and legs reach to their bones, so how thick their tissue is follows the body. Torso and back are as thick as
     their region; abdomen, neck and shoulders no thicker than theirs, in columns to spine or humerus. Fat and skin
     follow the person's weight and sex, fat also the side of a limb (stmpl_core.fat). The log tells of a person unlike
-    those who were measured: a child, or one much lighter or heavier.
+    those who were measured: below 1.4 m, as a child, or much lighter or heavier.
 
     Args:
         body: body.
@@ -97,9 +97,9 @@ def filled(body: Body, part: str, lay: Callable[..., SoftLayer], tone: Tone = "r
         tone: state of the muscle.
     """
     skin = None if part in STRAIGHT else lay(thickness=SHEET)  # refuses a part that is none
+    its = for_person(region(part, tone), body.physique)
     if why := unmeasured(body.physique):
         log.warning("skin, fat and muscle of %s may be wrong: %s", part, why)
-    its = for_person(region(part, tone), body.physique)
     if skin is None:
         return lay(thickness=its.thickness, tissue=its.tissue)
     fat = fat_map(body, part, skin.vertices)

@@ -33,7 +33,7 @@ from stmpl_core.trust import Displacement, Trust
 from stmpl_core.twins import going_together
 from stmpl_core.wake import sunk
 
-LEAST_HELD = 0.08  # motion that is held back, over the peak, from which it is said: less is within the stated bound
+LEAST_HELD = 0.02, 0.08  # motion held back, over the peak, from which it is flagged: without, with a bound beside it
 MOST_MOVED = 0.95  # motion over the thickness from which it is held back
 ELSEWHERE = 1e-3  # distance of a touch's skin from where it is now, over the thickness, from which it is another's
 FEW_NODES, MANY_NODES = 160, 240  # nodes up to which skin goes with its tools node by node, and from which by vertices
@@ -204,15 +204,15 @@ class Simulator:
                                    in_range=False)  # fmt: skip
         if fitted.entered > MAX_ENTERED_SHARE * float(self.skin.near.thickness.min()):
             trust = trust.also(f"skin is {fitted.entered * 1e3:.2f} mm inside a tool", in_range=False)
-        displacement, peak, cut = _within(fitted.displacement, self.layer.thickness)
-        if cut:
-            trust = trust.also(f"skin would move further than there is any at {cut} of its vertices: held back there",
+        displacement, peak, held = _within(fitted.displacement, self.layer.thickness)
+        known = getattr(self.method, "contact_bound" if by_vertices else "stick_bound", None)
+        if held > LEAST_HELD[known is not None] * peak:
+            trust = trust.also(f"skin would move {held * 1e3:.2g} mm further than there is any: held back",
                                in_range=False)  # fmt: skip
         if trust.in_range:
-            known = getattr(self.method, "contact_bound" if by_vertices else "stick_bound", None)
             bound = motion_bound(known, touches, moves, peak, left)
             if bound is not None:
-                bound = max(bound, beside_walls(self.layer, moves, displacement))
+                bound = max(bound, beside_walls(self.layer, moves, displacement), held)
             trust = replace(trust, error_bound=bound)
         return Answer(displacement, trust, solved.method, pressure, {touch.name: touch for touch in touches})
 
@@ -317,23 +317,23 @@ def _deeper(fitted: Conformed, share: float, there: Conformed, inward: np.ndarra
     return Conformed(other, max(fitted.corrected, there.corrected), max(fitted.entered, share * there.entered))
 
 
-def _within(displacement: np.ndarray, thickness: np.ndarray) -> tuple[np.ndarray, float, int]:
-    """The displacement, no longer than the layer is thick anywhere, its peak [m], how many were held back by much.
+def _within(displacement: np.ndarray, thickness: np.ndarray) -> tuple[np.ndarray, float, float]:
+    """The displacement, no longer than the layer is thick anywhere, its peak, and the most that one is held back [m].
 
     A motion's far end may reach skin a tenth of a millimetre thick, as in the folds of an armpit: that changes nothing.
     """
     peak, many = _peak(displacement, thickness)
     if not many:
-        return displacement, peak, 0
+        return displacement, peak, 0.0
     length = np.linalg.norm(displacement, axis=1)
     long = np.flatnonzero(length > MOST_MOVED * thickness)
     over = (length[long] / thickness[long] - MOST_MOVED) / (1 - MOST_MOVED)
     held = thickness[long] * (MOST_MOVED + (1 - MOST_MOVED) * np.tanh(over))  # smooth, and never further
     out = displacement.copy()
     out[long] *= (held / length[long])[:, None]
-    many = int((length[long] - held > LEAST_HELD * peak).sum())
+    most = float((length[long] - held).max(initial=0.0))
     length[long] = held
-    return out, float(length.max()), many
+    return out, float(length.max()), most
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"nnan", "nsz", "reassoc"})

@@ -17,6 +17,7 @@ from stmpl_core.tissue import Membrane, Tissue
 RADII = (2e-3, 4e-3, 9e-3, 19e-3, 40e-3)  # radii of loads that one effective layer shall serve [m]
 THINNEST, THICKEST = 0.02, 4.0  # bounds of the effective layer's thickness, over that of the stack
 LEAST_GIVE = 0.95  # its least, over that of a first material which gives as much as the stack under an even stress
+STIFFENING = 0.5, 50.0  # moduli over the first material's that the networks know apart, least and most
 WHERE = np.linspace(0, 1, 9)  # places in a contact that lie on the ball, over its radius
 FLIP = np.array([[1.0, -1.0], [-1.0, 1.0]])  # signs of a 2 x 2 stiffness in a mirror
 
@@ -251,7 +252,7 @@ def stiffening(tissue: Tissue, thickness: ArrayLike) -> np.ndarray:
     """How much stiffer columns are below their first material: moments over depth of log(E / E of the first), (V, 2).
 
     The mean, and the mean weighed with 2 z - 1 at the depth z over the thickness: how much of it lies deep. Both are 0
-    of one material.
+    of one material. What is much softer or stiffer than the first counts as STIFFENING says: the rest is nearly bone.
 
     Args:
         tissue: materials.
@@ -262,7 +263,7 @@ def stiffening(tissue: Tissue, thickness: ArrayLike) -> np.ndarray:
     for k, ply in enumerate(tissue.deeper):
         end = tissue.deeper[k + 1].depth if k + 1 < len(tissue.deeper) else np.inf
         a, b = np.minimum(ply.depth / thickness, 1), np.minimum(end / thickness, 1)
-        more = np.log(ply.youngs_modulus / tissue.youngs_modulus)
+        more = np.log(np.clip(ply.youngs_modulus / tissue.youngs_modulus, *STIFFENING))
         out += more * np.column_stack([b - a, (b - a) * (a + b - 1)])
     return out
 

@@ -27,6 +27,7 @@ from studies.train_moments import Layers, OnProgress, stacked, training_card
 FORCE = 1.0  # weight of the force's error beside the pressure's
 LEFT_OUT = 3  # parts of the bodies, each left out once, from whose errors the bound on stacks follows
 ROUNDER = 0.3  # standard deviations beyond what was met up to which limbs may be curved: force is 1 to 4 % off there
+STIFFER = 0.3  # likewise of how much stiffer columns are below: a tensed shoulder's is at the end of what was met
 TYPICAL = 0.02  # of force and pressure: errors below count as squares in the loss
 
 
@@ -151,6 +152,9 @@ def fit(data: Rows, settings: ContactTraining, on_progress: OnProgress, flat: Ro
     if data.rows.shape[1] == STACK_NODE.size:
         at = STACK_NODE.at.curvature
         model.high[at] += ROUNDER / model.scale[at]
+        for at in range(STACK_NODE.at.stiffening, STACK_NODE.size):
+            model.low[at] -= STIFFER / model.scale[at]
+            model.high[at] += STIFFER / model.scale[at]
     optimiser = torch.optim.AdamW(model.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimiser, settings.learning_rate, total_steps=settings.steps, pct_start=0.1

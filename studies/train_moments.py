@@ -272,6 +272,13 @@ class Model(Layers):
             self.least, self.most = _range(torch.cat([self._inputs(some)[0] for some in rows.split(100_000)]))
             self.low, self.high = self.least, self.most
 
+    def forget_stiffening(self) -> None:
+        """Takes no place for one that training did not see by how stiff the column is below: few stacks were learnt."""
+        if self.known is STACK_POINT:
+            some = slice(STACK_INPUTS.at.stiffening, STACK_INPUTS.at.stiffening + STACK_INPUTS.sizes["stiffening"])
+            self.least, self.most = self.least.clone(), self.most.clone()
+            self.least[some], self.most[some] = -torch.inf, torch.inf
+
     def _inputs(self, rows: Tensor) -> tuple[Tensor, ...]:
         known = self.known.split(rows)
         fields = known["figures"].view(-1, 2, WIDTH)
@@ -349,7 +356,7 @@ def fit(points: Points, settings: MomentTraining, out: Path, on_progress: OnProg
     checkpoint, first, mean = out / "moment_net.checkpoint", 0, 0.0
     if checkpoint.is_file():
         kept = torch.load(checkpoint, weights_only=True)
-        if kept["settings"] == settings.model_dump_json() and kept["points"] == len(rows):
+        if kept["settings"] == settings.model_dump_json() and kept["points"] == list(rows.shape):
             model.load_state_dict(kept["model"])
             optimiser.load_state_dict(kept["optimiser"])
             schedule.load_state_dict(kept["schedule"])
@@ -373,7 +380,7 @@ def fit(points: Points, settings: MomentTraining, out: Path, on_progress: OnProg
         if (step + 1) % 100 == 0 or step + 1 == settings.steps:
             on_progress(step + 1, settings.steps, f"error {mean:.2%} of the peak")
         if time.monotonic() - saved > 60 * settings.checkpoint_minutes:
-            state = {"settings": settings.model_dump_json(), "points": len(rows), "step": step + 1, "mean": mean,
+            state = {"settings": settings.model_dump_json(), "points": list(rows.shape), "step": step + 1, "mean": mean,
                      "model": model.state_dict(), "optimiser": optimiser.state_dict(),
                      "schedule": schedule.state_dict()}  # fmt: skip
             torch.save(state, checkpoint.with_suffix(".tmp"))
@@ -382,6 +389,7 @@ def fit(points: Points, settings: MomentTraining, out: Path, on_progress: OnProg
     low, high = model.low, model.high
     model.take_seen(torch.cat([rows, torch.from_numpy(points.light)]))
     model.low, model.high = low, high
+    model.forget_stiffening()
     return model
 
 
