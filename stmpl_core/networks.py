@@ -155,7 +155,7 @@ READS: dict[Kind, Layout] = {"motion": INPUTS, "pressure": NODE, "stack_motion":
 SINCE: dict[Kind, int] = {"stack_pressure": STACK_NODE.at.curvature}
 SAYS: dict[Kind, Layout] = {"motion": MOTION, "pressure": PRESSURE, "stack_motion": MOTION, "stack_pressure": PRESSURE}
 _LAYERS = ("low", "high", "mean", "scale", "w1", "b1", "w2", "b2", "w3", "b3", "w4", "b4")
-_MOTION = ("mix_vectors", "mix_tensors", "least", "most", *_LAYERS)  # least, most: what training inputs reached
+_MOTION = ("mix_vectors", "mix_tensors", "least", "most", *_LAYERS)  # least, most: what is known
 ARRAYS: dict[Kind, tuple[str, ...]] = {
     "motion": _MOTION, "pressure": _LAYERS, "stack_motion": _MOTION, "stack_pressure": _LAYERS,
 }  # fmt: skip

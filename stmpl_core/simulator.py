@@ -206,13 +206,13 @@ class Simulator:
             trust = trust.also(f"skin is {fitted.entered * 1e3:.2f} mm inside a tool", in_range=False)
         displacement, peak, held = _within(fitted.displacement, self.layer.thickness)
         known = getattr(self.method, "contact_bound" if by_vertices else "stick_bound", None)
-        if held > LEAST_HELD[known is not None] * peak:
-            trust = trust.also(f"skin would move {held * 1e3:.2g} mm further than there is any: held back",
+        if not held <= LEAST_HELD[known is not None] * peak:
+            trust = trust.also(f"skin would move {held * 1e3:.3g} mm further than there is any: held back",
                                in_range=False)  # fmt: skip
         if trust.in_range:
             bound = motion_bound(known, touches, moves, peak, left)
             if bound is not None:
-                bound = max(bound, beside_walls(self.layer, moves, displacement), held)
+                bound = max(bound, beside_walls(self.layer, moves, displacement)) + held
             trust = replace(trust, error_bound=bound)
         return Answer(displacement, trust, solved.method, pressure, {touch.name: touch for touch in touches})
 

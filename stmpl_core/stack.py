@@ -252,7 +252,7 @@ def stiffening(tissue: Tissue, thickness: ArrayLike) -> np.ndarray:
     """How much stiffer columns are below their first material: moments over depth of log(E / E of the first), (V, 2).
 
     The mean, and the mean weighed with 2 z - 1 at the depth z over the thickness: how much of it lies deep. Both are 0
-    of one material. What is much softer or stiffer than the first counts as STIFFENING says: the rest is nearly bone.
+    of one material. What is much softer or stiffer than the first counts as STIFFENING says: no such stack was learnt.
 
     Args:
         tissue: materials.

@@ -84,8 +84,8 @@ OVER_SOFT = 0.25, 0.04, 0.15  # bound by how much stiffer a material is than one
 MOST_OVER_SOFT = 0.35  # that share of the bound beyond which it is flagged: a tensed belly has 0.31
 RATIOS_APART = 0.06  # difference of the materials' Poisson's ratios: 0.05 cost nothing, of 0.1 force is 15 % off
 MAX_PULL = 1.0, 1.5  # T / (E t) of the effective layer that is tried: of any skin, and of skin no tauter than TAUT
-TAUT = 0.12, 1.0, 1.2  # T / (E_s h) up to which limbs were learnt (0.1), as the regions' skins are, also relaxed; bound
-# beyond, at most, and its rise: of a tube 0.55 of its radius thick force is 15 % off at 0.93
+TAUT = 0.12, 1.0, 1.6  # T / (E_s h) up to which limbs were learnt (0.1), as the regions' skins are, also relaxed; bound
+# beyond, at most, and its rise: of a tube 0.55 of its radius thick force is 10 % off at 0.27, 12 at 0.47, 15 at 0.93
 PULLS_FROM = 0.2  # T / (E t) from which that is widened in full: what hardly pulls widens hardly
 SLACK = 0.012, 0.5  # T / (E_s h), and kappa, below and above which skin is slack and matters: force then falls with T
 PINS = 3  # tools side by side from which they may be pins of one brush

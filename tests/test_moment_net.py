@@ -23,7 +23,7 @@ from stmpl_core.methods import Linear, MomentNet
 from stmpl_core.methods.moment_net import invariants, source_fields
 from stmpl_core.metrics import score
 from stmpl_core.moments import Surroundings
-from stmpl_core.networks import INPUTS, POINT
+from stmpl_core.networks import INPUTS, POINT, STACK_INPUTS
 from stmpl_core.response import REACH
 from studies.train_moments import Model, MomentTraining, draw_points, fit, train_moments
 from tests import scenes
@@ -195,6 +195,17 @@ def test_misuse_is_refused(tmp_path: Path) -> None:
     (tmp_path / "bad.safetensors").write_bytes(b"not weights")
     with pytest.raises(InvalidInput):
         MomentNet(tmp_path / "bad.safetensors")
+
+
+def test_no_place_is_unseen_by_how_stiff_its_column_is_below() -> None:
+    """Motion learns from bodies only: a tensed abdomen, softer below than most, would be flagged all over."""
+    of_stacks, plain = Model(8, STACK_INPUTS), Model(8)
+    for model in (of_stacks, plain):
+        model.forget_stiffening()
+    ends = [(w.arrays["least"], w.arrays["most"], w.arrays["low"]) for w in (of_stacks.weights({}), plain.weights({}))]
+    free = np.isinf(ends[0][0])
+    assert set(np.flatnonzero(free)) == {STACK_INPUTS.at.stiffening, STACK_INPUTS.at.stiffening + 1}
+    assert (free == np.isinf(ends[0][1])).all() and np.isfinite(ends[0][2]).all() and np.isfinite(ends[1]).all()
 
 
 def test_numba_and_torch_see_the_same_inputs() -> None:

@@ -138,3 +138,16 @@ class Silent(MomentNet):
 def test_a_method_that_knows_none_states_none() -> None:
     answer = pressed(Simulator(LIMB, Silent()), 2e-3)
     assert answer.trust.in_range and answer.trust.error_bound is None
+
+
+@pytest.mark.parametrize("share, flagged", [(0.01, (False, False)), (0.05, (True, False)), (0.1, (True, True))])
+def test_motion_that_is_held_back_is_flagged_or_in_the_bound(monkeypatch, share, flagged) -> None:
+    """Of a method without a bound from 0.02 of the peak on, of one with a bound from 0.08."""
+    answers = [pressed(Simulator(LIMB, method), 2e-3) for method in (Silent(), MomentNet())]
+    peak = answers[1].magnitude.max()
+    monkeypatch.setattr("stmpl_core.simulator._within", lambda moved, _: (moved, peak, share * peak))
+    held = [pressed(Simulator(LIMB, method), 2e-3) for method in (Silent(), MomentNet())]
+    assert tuple("held back" in one.trust.why for one in held) == flagged
+    assert tuple(not one.trust.in_range for one in held) == flagged
+    if not flagged[1]:
+        assert held[1].trust.error_bound == pytest.approx(answers[1].trust.error_bound + share * peak)

@@ -290,9 +290,9 @@ def test_a_deeper_material_of_another_poissons_ratio_presses_as_finite_elements_
     assert ("Poisson's ratio" in touch.trust.why) == (deeper != 0.40)
 
 
-@pytest.mark.parametrize("tension, sound", [(0.0, False), (20.0, True), (70.0, True), (100.0, False)])
+@pytest.mark.parametrize("tension, sound", [(0.0, False), (20.0, True), (50.0, True), (70.0, True), (100.0, False)])
 def test_force_under_slack_and_tight_skin_is_within_its_bound_or_flagged(tension: float, sound: bool) -> None:
-    """Beside finite elements round a limb of 45 mm, half of the thickness deep: 15 % too small at 70 N/m.
+    """Beside finite elements round a limb of 45 mm, half of the thickness deep: 10 % too small at 20 N/m, 15 at 70.
 
     So taut beside its own stiffness, T / (E_s h) = 0.27 and 0.9, is no region's skin (0.07 at most, 0.12 relaxed).
     """
@@ -336,9 +336,9 @@ def over(stiff: float, depth: float, soft: float) -> Tissue:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tissue, sound", [(of_ratio(0.35), True), (over(12e3, 10e-3, 4e3), False),
-                                           (over(20e3, 8e-3, 2e3), False)])  # fmt: skip
-def test_the_bound_covers_tissue_that_few_contacts_were_learnt_with(tissue: Tissue, sound: bool) -> None:
+@pytest.mark.parametrize("tissue, sound, least", [(of_ratio(0.35), True, 0.9), (over(12e3, 10e-3, 4e3), False, 0.8),
+                                                  (over(20e3, 8e-3, 2e3), False, 0.9)])  # fmt: skip
+def test_the_bound_covers_tissue_that_few_contacts_were_learnt_with(tissue: Tissue, sound: bool, least: float) -> None:
     """Finite elements press 10 % harder than the first, 9 and 29 % less than the others, about."""
     layer = limb(5e-3, 25e-3, 45e-3, 0.16).with_(tissue=tissue)
     contact = contact_of(ball(20e-3, 4), at(45e-3 + 20e-3 - 10e-3, 0, 0.08))
@@ -346,7 +346,7 @@ def test_the_bound_covers_tissue_that_few_contacts_were_learnt_with(tissue: Tiss
     (touch,), truth = answer.touches.values(), RigidFem().prepare(layer).press([contact], answer)
     assert touch.trust.in_range == sound and ("over a much softer one" in touch.trust.why) != sound
     off = abs(touch.force - truth.trust.figures["probe.normal_n"])
-    assert 0.8 * touch.force_bound / tissue_doubt(layer) < off < touch.force_bound
+    assert least * touch.force_bound / tissue_doubt(layer) < off < touch.force_bound
 
 
 def test_how_far_tissue_is_from_what_was_learnt() -> None:

@@ -154,6 +154,11 @@ def test_how_much_stiffer_a_column_is_below_is_none_of_one_material_and_fades_as
     assert near == pytest.approx([0, 0], abs=1e-6)
 
 
+def test_what_is_nearly_bone_counts_as_the_stiffest_that_was_learnt():
+    found = [stiffening(Tissue(2e3, 0.45, deeper=(Ply(4e-3, modulus),)), [0.02]) for modulus in (1e5, 2e6, 1e3, 1e2)]
+    assert (found[0] == found[1]).all() and (found[2] == found[3]).all() and found[0][0, 0] > 3 > 0 > found[2][0, 0]
+
+
 def test_how_much_stiffer_a_column_is_below_is_the_mean_of_its_depths():
     stack, t = Tissue(2e3, 0.45, deeper=(Ply(4e-3, 1e3), Ply(1.1e-2, 3e4))), 0.025
     z = (np.arange(100_000) + 0.5) / 100_000
