@@ -298,7 +298,7 @@ def test_a_ball_that_sinks_under_the_skin_beside_it_presses_as_finite_elements_s
     assert press is not None
     deep = press.at(strain * float(layer.thickness[vertex])).pose_body_from_tool
     (touch,) = Simulator(layer, MomentNet()).touch([Contact(ball(RADIUS), deep)])
-    assert touch.force == pytest.approx(truth, rel=0.04)
+    assert touch.force == pytest.approx(truth, rel=0.05)
 
 
 @pytest.mark.parametrize(("part", "edge", "place", "truths"), [
