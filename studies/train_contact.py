@@ -152,9 +152,9 @@ def fit(data: Rows, settings: ContactTraining, on_progress: OnProgress, flat: Ro
     if data.rows.shape[1] == STACK_NODE.size:
         at = STACK_NODE.at.curvature
         model.high[at] += ROUNDER / model.scale[at]
-        some = slice(STACK_NODE.at.stiffening, STACK_NODE.at.stiffening + STACK_NODE.sizes["stiffening"])
-        model.low[some] -= STIFFER / model.scale[some]
-        model.high[some] += STIFFER / model.scale[some]
+        low, high, scale = (STACK_NODE.split(x[None])["stiffening"] for x in (model.low, model.high, model.scale))
+        low -= STIFFER / scale
+        high += STIFFER / scale
     optimiser = torch.optim.AdamW(model.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimiser, settings.learning_rate, total_steps=settings.steps, pct_start=0.1

@@ -275,9 +275,9 @@ class Model(Layers):
     def forget_stiffening(self) -> None:
         """Takes no place for one that training did not see by how stiff the column is below: few stacks were learnt."""
         if self.known is STACK_POINT:
-            some = slice(STACK_INPUTS.at.stiffening, STACK_INPUTS.at.stiffening + STACK_INPUTS.sizes["stiffening"])
             self.least, self.most = self.least.clone(), self.most.clone()
-            self.least[some], self.most[some] = -torch.inf, torch.inf
+            for end, free in ((self.least, -torch.inf), (self.most, torch.inf)):
+                STACK_INPUTS.split(end[None])["stiffening"][:] = free
 
     def _inputs(self, rows: Tensor) -> tuple[Tensor, ...]:
         known = self.known.split(rows)
