@@ -50,6 +50,7 @@ from tests.scenes import ball
 
 MS = 1_000_000
 SPEED = np.array([0.0, 0.0, 0.126])  # of the frame "base" in the body's [m/s]
+begun = [0]  # stamp at which "base" is at the body's origin [ns]
 
 
 class Scene(NamedTuple):
@@ -79,7 +80,7 @@ def tf2(monkeypatch) -> None:
 def base_at(stamp: int) -> np.ndarray:
     """pose_body_from_base (4, 4) at a stamp [ns]: it moves along the limb."""
     place = np.eye(4)
-    place[:3, 3] = SPEED * ((stamp % (20 * NANO)) / NANO - 10)
+    place[:3, 3] = SPEED * ((stamp - begun[0]) / NANO)
     return place
 
 
@@ -93,6 +94,7 @@ def told(parent: str, child: str, place: np.ndarray, stamp: int) -> TransformSta
 
 @pytest.fixture
 def scene(request) -> Iterator[Scene]:
+    begun[0] = time.time_ns()
     context = rclpy.Context()
     context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + DOMAINS)
     executor = SingleThreadedExecutor(context=context)
