@@ -1,6 +1,6 @@
 """Contact against rigid tools solved by finite elements: force, pressure, area and motion; and what a step costs.
 
-    .venv/bin/python -m benchmarks.contact      # prints tables, writes docs/contact.json and docs/pictures/contact.png
+    .venv/bin/python -m benchmarks.contact      # prints tables, draws docs/pictures/contact.png
     .venv/bin/python -m benchmarks.contact --tools egg hook --finer    # these alone, elements half as long
 
 The tools are pressed straight into the 3 mm arm. None was trained on: their sizes, places and this skin are new, and
@@ -12,10 +12,9 @@ data/contact_truth, and writes tools_v1.npz anew.
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -332,9 +331,6 @@ def main() -> None:
     console.print(_table(rows))
     console.print(_summary(rows))
     console.print(_time_table(times))
-    kept = {"rows": [asdict(r) for r in rows],
-            "ms": {n: {k: _percentiles(v) for k, v in t.items()} for n, t in times.items()}}  # fmt: skip
-    (DOCS / "contact.json").write_text(json.dumps(kept, indent=1) + "\n")
     draw(rows, DOCS / "pictures" / "contact.png")
 
 

@@ -1,11 +1,12 @@
 """A robot's end of the ROS bus, and the processes at its other end. conftest.py gives each test process its own bus."""
 
+import os
 import signal
 import subprocess
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,11 @@ from typing import Any
 import numpy as np
 import rclpy
 from rcl_interfaces.msg import Log
+from rclpy.executors import SingleThreadedExecutor
 from stmpl_msgs.msg import SkinDisplacement, SkinTopology
 
 from bags.wire import stamp_ns
+from stmpl_ros.domain import DOMAINS
 from stmpl_ros.topics import KEPT, STREAM
 
 ROOT = Path(__file__).parents[1]
@@ -31,6 +34,33 @@ def wait_for(done: Callable[[], Any], what: str, *nodes: rclpy.node.Node, second
         for node in nodes:
             rclpy.spin_once(node, timeout_sec=0.02 / len(nodes))
     return found
+
+
+@contextmanager
+def in_process(make: Callable[[rclpy.Context], Any]) -> Iterator[tuple[Any, rclpy.node.Node, Callable[..., None]]]:
+    """A node in this process, another beside it, and `wait(done, do)`: both spin, and `do` is done, until `done`."""
+    context = rclpy.Context()
+    context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + DOMAINS)
+    executor = SingleThreadedExecutor(context=context)
+    node, other = make(context), rclpy.create_node("other", context=context)
+
+    def wait(done: Callable[[], object], do: Callable[[], object] = lambda: None) -> None:
+        until = time.monotonic() + PATIENCE
+        while not done():
+            assert time.monotonic() < until
+            do()
+            executor.spin_once(timeout_sec=0.005)
+
+    try:
+        executor.add_node(node)
+        executor.add_node(other)
+        yield node, other, wait
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+        other.destroy_node()
+        context.try_shutdown()
+        context.destroy()
 
 
 def start(*arguments: str, **options: Any) -> subprocess.Popen:

@@ -2,7 +2,6 @@
 
 import ast
 import multiprocessing
-import os
 import runpy
 import signal
 import subprocess
@@ -31,7 +30,6 @@ from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import SetParameters
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.qos import LivelinessPolicy, QoSProfile
@@ -44,14 +42,13 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import PAIRS
 from stmpl_ros import lifecycle
 from stmpl_ros.beside import Beside, Builders
-from stmpl_ros.domain import DOMAINS
 from stmpl_ros.hearing import Hearing
 from stmpl_ros.inbox import Instant
 from stmpl_ros.node import SkinNode
 from stmpl_ros.parameters import NodeConfig
 from stmpl_ros.sending import Sending
 from stmpl_ros.topics import KEPT, LEASE, STREAM
-from tests.bus import PATIENCE, ROOT, end, rows, running, start
+from tests.bus import PATIENCE, ROOT, end, in_process, rows, running, start
 from tests.node_bus import HERE, NODE, PUSH, Bus, skin
 from tests.scenes import ball, contact_of
 
@@ -92,44 +89,25 @@ class Composed(NamedTuple):
 @pytest.fixture
 def composed():
     """SkinNode is an ordinary node to whoever composes."""
-    context = rclpy.Context()
-    context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + DOMAINS)
-    executor = SingleThreadedExecutor(context=context)
-    node = SkinNode(NodeConfig(), skin, context=context)
-    other = rclpy.create_node("other", context=context)
-    heard: list[SkinDisplacement] = []
-    other.create_subscription(SkinDisplacement, "skin/displacement", heard.append, STREAM)
-    mesh = other.create_publisher(ContactMesh, "contact_mesh", KEPT)
-    pose = other.create_publisher(PoseStamped, "tools/finger/pose", STREAM)
+    with in_process(lambda context: SkinNode(NodeConfig(), skin, context=context)) as (node, other, wait):
+        heard: list[SkinDisplacement] = []
+        other.create_subscription(SkinDisplacement, "skin/displacement", heard.append, STREAM)
+        mesh = other.create_publisher(ContactMesh, "contact_mesh", KEPT)
+        pose = other.create_publisher(PoseStamped, "tools/finger/pose", STREAM)
 
-    def press() -> int:
-        stamp = other.get_clock().now().nanoseconds
-        pose.publish(pose_message(HERE, "body", stamp))
-        return stamp
+        def press() -> int:
+            stamp = other.get_clock().now().nanoseconds
+            pose.publish(pose_message(HERE, "body", stamp))
+            return stamp
 
-    def announce(tool: Tool) -> None:
-        mesh.publish(tool_message(tool, 0))
+        def announce(tool: Tool) -> None:
+            mesh.publish(tool_message(tool, 0))
 
-    def wait(done: Callable[[], object]) -> None:
-        until = time.monotonic() + PATIENCE
-        while not done():
-            assert time.monotonic() < until
-            executor.spin_once(timeout_sec=0.02)
-
-    try:
-        executor.add_node(node)
-        executor.add_node(other)
         node.trigger_configure()
         node.trigger_activate()
         announce(ball().named("finger"))
         wait(pose.get_subscription_count)
         yield Composed(node, heard, press, announce, wait)
-    finally:
-        executor.shutdown()
-        node.destroy_node()
-        other.destroy_node()
-        context.try_shutdown()
-        context.destroy()
 
 
 def test_the_node_runs_beside_another_in_any_executor(composed):

@@ -14,7 +14,6 @@ import rclpy
 from builtin_interfaces.msg import Time as TimeMessage
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, TransformStamped, WrenchStamped
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
@@ -44,7 +43,7 @@ from stmpl_ros.parameters import NodeConfig
 from stmpl_ros.ticks import Ticks
 from stmpl_ros.topics import KEPT, STREAM
 from tests import tf2_stand_in
-from tests.bus import PATIENCE
+from tests.bus import in_process
 from tests.node_bus import HERE, skin
 from tests.scenes import ball
 
@@ -95,48 +94,30 @@ def told(parent: str, child: str, place: np.ndarray, stamp: int) -> TransformSta
 @pytest.fixture
 def scene(request) -> Iterator[Scene]:
     begun[0] = time.time_ns()
-    context = rclpy.Context()
-    context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + DOMAINS)
-    executor = SingleThreadedExecutor(context=context)
-    node = SkinNode(NodeConfig(**getattr(request, "param", {})), skin, context=context)
-    other = rclpy.create_node("other", context=context)
-    heard, health, poses = list[SkinDisplacement](), list[DiagnosticStatus](), list[PoseStamped]()
-    other.create_subscription(SkinDisplacement, "skin/displacement", heard.append, STREAM)
-    other.create_subscription(DiagnosticArray, "/diagnostics", lambda m: health.append(m.status[0]), STREAM)
-    other.create_subscription(PoseStamped, "tools/finger/pose", poses.append, STREAM)
-    mesh = other.create_publisher(ContactMesh, "contact_mesh", KEPT)
-    pose = other.create_publisher(PoseStamped, "tools/finger/pose", STREAM)
-    wrench = other.create_publisher(WrenchStamped, "tools/finger/wrench", STREAM)
+    config = NodeConfig(**getattr(request, "param", {}))
+    with in_process(lambda context: SkinNode(config, skin, context=context)) as (node, other, wait):
+        heard, health, poses = list[SkinDisplacement](), list[DiagnosticStatus](), list[PoseStamped]()
+        other.create_subscription(SkinDisplacement, "skin/displacement", heard.append, STREAM)
+        other.create_subscription(DiagnosticArray, "/diagnostics", lambda m: health.append(m.status[0]), STREAM)
+        other.create_subscription(PoseStamped, "tools/finger/pose", poses.append, STREAM)
+        mesh = other.create_publisher(ContactMesh, "contact_mesh", KEPT)
+        pose = other.create_publisher(PoseStamped, "tools/finger/pose", STREAM)
+        wrench = other.create_publisher(WrenchStamped, "tools/finger/wrench", STREAM)
 
-    def send(stamp: int) -> None:
-        pose.publish(pose_message(np.linalg.inv(base_at(stamp)) @ HERE, "base", stamp))
+        def send(stamp: int) -> None:
+            pose.publish(pose_message(np.linalg.inv(base_at(stamp)) @ HERE, "base", stamp))
 
-    def push(stamp: int) -> None:
-        wrench.publish(wrench_message(np.array([-0.03, 0, 0, 0, 0, 0]), "base", stamp))
+        def push(stamp: int) -> None:
+            wrench.publish(wrench_message(np.array([-0.03, 0, 0, 0, 0, 0]), "base", stamp))
 
-    def move(stamp: int) -> None:
-        node.hearing.frames._buffer.set_transform(told("body", "base", base_at(stamp), stamp), "test")
+        def move(stamp: int) -> None:
+            node.hearing.frames._buffer.set_transform(told("body", "base", base_at(stamp), stamp), "test")
 
-    def wait(done: Callable[[], object]) -> None:
-        until = time.monotonic() + PATIENCE
-        while not done():
-            assert time.monotonic() < until
-            executor.spin_once(timeout_sec=0.005)
-
-    try:
-        executor.add_node(node)
-        executor.add_node(other)
         node.trigger_configure()
         node.trigger_activate()
         mesh.publish(tool_message(ball().named("finger"), 0))
         wait(lambda: "finger" in node.hearing.tools)
         yield Scene(node, heard, health, poses, send, push, move, wait)
-    finally:
-        executor.shutdown()
-        node.destroy_node()
-        other.destroy_node()
-        context.try_shutdown()
-        context.destroy()
 
 
 def test_a_pose_in_a_moving_frame_is_where_that_was_at_its_stamp(scene):
@@ -365,38 +346,23 @@ class Simulation(NamedTuple):
 
 @pytest.fixture
 def simulation() -> Iterator[Simulation]:
-    context = rclpy.Context()
-    context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + DOMAINS)
-    executor = SingleThreadedExecutor(context=context)
-    node = rclpy.create_node("sim", context=context, parameter_overrides=[Parameter("use_sim_time", value=True)])
-    other = rclpy.create_node("gz", context=context)
-    clock = other.create_publisher(Clock, "/clock", 10)
+    simulated = [Parameter("use_sim_time", value=True)]
 
-    def until(done: Callable[[], bool], do: Callable[[], object] = lambda: None) -> None:
-        last = time.monotonic() + PATIENCE
-        while not done():
-            assert time.monotonic() < last
-            do()
-            executor.spin_once(timeout_sec=0.02)
+    def make(context: rclpy.Context) -> Any:
+        return rclpy.create_node("sim", context=context, parameter_overrides=simulated)
 
-    def say(seconds: float) -> None:
-        told = Clock(clock=TimeMessage(sec=int(seconds), nanosec=round(seconds % 1 * 1e9)))
-        until(lambda: node.get_clock().now().nanoseconds == round(seconds * 1e9), lambda: clock.publish(told))
+    with in_process(make) as (node, other, wait):
+        clock = other.create_publisher(Clock, "/clock", 10)
 
-    def leave() -> None:
-        other.destroy_publisher(clock)
-        until(lambda: not node.count_publishers("/clock"))
+        def say(seconds: float) -> None:
+            told = Clock(clock=TimeMessage(sec=int(seconds), nanosec=round(seconds % 1 * 1e9)))
+            wait(lambda: node.get_clock().now().nanoseconds == round(seconds * 1e9), lambda: clock.publish(told))
 
-    try:
-        executor.add_node(node)
-        executor.add_node(other)
+        def leave() -> None:
+            other.destroy_publisher(clock)
+            wait(lambda: not node.count_publishers("/clock"))
+
         yield Simulation(node, Ticks(node), say, leave)
-    finally:
-        executor.shutdown()
-        node.destroy_node()
-        other.destroy_node()
-        context.try_shutdown()
-        context.destroy()
 
 
 def test_a_simulation_slower_than_its_clock_is_not_silent_and_one_that_is_gone_is(simulation):
