@@ -204,7 +204,11 @@ class ContactNet:
 
     def unlike(self, thickness: float) -> float:
         """|log| of the tissue's mean thickness under a contact [m], over the limb's median; 0 of one material."""
-        return 0.0 if self._green is None else abs(math.log(thickness / self._green.thickness))
+        return abs(self.thicker(thickness))
+
+    def thicker(self, thickness: float) -> float:
+        """Logarithm of the same; 0 of one material."""
+        return 0.0 if self._green is None else math.log(thickness / self._green.thickness)
 
     def look(self, nodes: Nodes) -> Look:
         """Solves the linear problem at the nodes, at least one, and gathers what the network reads."""

@@ -126,6 +126,7 @@ class Green:
         Raises:
             InvalidInput, MeshError: the skin cannot be meshed coarsely.
         """
+        layer = layer.typical
         kept = _KEPT.get(layer)
         if not isinstance(kept, Green):
             kept = _KEPT[layer] = kept() if kept else cls(layer, CoarseResponse.of(layer) if layer.stacked else None)
@@ -134,17 +135,17 @@ class Green:
     @staticmethod
     def kept(layer: SoftLayer) -> Green | None:
         """The response of a layer, if it was made."""
-        kept = _KEPT.get(layer)
+        kept = _KEPT.get(layer.typical)
         return kept if isinstance(kept, Green) else None
 
     @staticmethod
     def keep_for(layer: SoftLayer, make: Callable[[], Green]) -> None:
         """Lets `of` make the response of a layer so, when it is wanted; `make` must not hold the layer itself."""
-        _KEPT[layer] = make
+        _KEPT[layer.typical] = make
 
     def keep(self, layer: SoftLayer) -> None:
         """Lets `of` give this one for another layer, of the same shape and the same ratios of moduli."""
-        _KEPT[layer] = self
+        _KEPT[layer.typical] = self
 
     def stiffened(self, layer: SoftLayer, near: Surroundings) -> Green:
         """The same response of a layer that differs in E alone, with its neighbours."""

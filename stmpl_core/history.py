@@ -55,11 +55,13 @@ class History:
 
     def __init__(self, toucher: Toucher, friction: Friction | Mapping[str, Friction] = None) -> None:
         self.toucher = toucher
-        self._rest = layer = toucher.layer
+        layer = toucher.layer
+        self._rest = layer.typical
         self.frictions = coefficients(friction)
         thickness = float(np.median(layer.thickness))
         self.series = series_of(layer.tissue, thickness)
         self._last: State | None = None  # state of the last step, which is one of this skin
+        self._told_last: list[Touch] = []  # what that step returned
         self._skin = shape_of(layer)
         self._tissue = number_of(layer.tissue)
 
@@ -153,8 +155,15 @@ class History:
         for name in names[many:] if dt > 0 else ():
             if not (memories[name].sunk or memories[name].trail.any()):
                 del memories[name]
-        self._last = State(memories, here, self._skin, self._tissue)
+        self._last, self._told_last = State(memories, here, self._skin, self._tissue), touches
         return touches, self._last
+
+    def left_out(self, touches: Sequence[Touch]) -> list[str]:
+        """Tools whose skin is not back yet and that were not among the contacts, if the last step returned these."""
+        if touches is not self._told_last or self._last is None:
+            return []
+        names = {touch.name for touch in touches}
+        return [name for name, memory in self._last.tools.items() if name not in names and memory.sunk]
 
     def _check(self, state: State) -> None:
         """Refuses a state of another skin; see `step`."""

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 HOLLOW = 0.02  # volume over area^1.5 from which an open skin encloses one: half of that of a limb that is long and thin
+AS_TOLD = 1e-3  # difference of the median ply_scale from 1 below which materials begin as deep as the tissue says
 MAX_EXTENT = 4.0  # largest extent of a skin [m]; that of a mesh in millimetres is larger
 STEEPEST = 0.35  # cosine between the normal and a column to the core, below which the column's length counts
 MOST_OUTSIDE = 0.01  # share of the skin whose core may lie on its other side, as where joints fold it
@@ -90,6 +91,7 @@ class SoftLayer:
         if self.bony is not None and self.bony.shape != (len(self.vertices),):
             raise InvalidInput(f"bony has shape {self.bony.shape}, the skin has {len(self.vertices)} vertices.")
         self.chart, self.rig = chart, rig
+        self._typical: tuple[SoftLayer, SoftLayer] | None = None
         if rig is not None and not hasattr(rig, "weights"):
             raise InvalidInput(f"rig is {rig!r:.40}; Rig or None is needed.")
         if rig is not None and len(rig.weights) != len(self.vertices):
@@ -148,6 +150,18 @@ class SoftLayer:
     def stacked(self) -> bool:
         """Whether it is more than one material straight below the skin: a skin, deeper materials, or a core."""
         return not self.tissue.single or self.core is not None
+
+    @property
+    def typical(self) -> SoftLayer:
+        """The same layer with depths of deeper materials as they are in the median: `ply_scale` about 1. Made once."""
+        middle = 1.0 if self.ply_scale is None else float(np.median(self.ply_scale))
+        if abs(middle - 1) < AS_TOLD:
+            return self
+        if self._typical is None or self._typical[0] is not self:  # of which this is a copy
+            deeper = tuple(replace(ply, depth=middle * ply.depth) for ply in self.tissue.deeper)
+            self._typical = self, self.with_(tissue=replace(self.tissue, deeper=deeper),
+                                             ply_scale=np.asarray(self.ply_scale) / middle)  # fmt: skip
+        return self._typical[1]
 
     @property
     def below(self) -> dict[str, np.ndarray]:

@@ -174,6 +174,8 @@ class Simulator:
         Raises:
             InvalidInput: touches of another skin, or made where its joints were elsewhere.
         """
+        left_out = self.history.left_out(touches)
+
         # Sum: pressures of several tools add.
         try:
             touches = list(touches)
@@ -202,6 +204,9 @@ class Simulator:
             if touch.name not in self.tools and (touch.imprint is not None or (touch.wake and touch.wake.grooves())):
                 trust = trust.also(f"{touch.name} was taken away: the skin that it left sunk is shown at rest",
                                    in_range=False)  # fmt: skip
+        if left_out:
+            trust = trust.also(f"{', '.join(left_out)} was left out of the contacts: the skin that it left sunk is "
+                               "shown at rest. Keep it among them, away from the skin", in_range=False)  # fmt: skip
         if fitted.entered > MAX_ENTERED_SHARE * float(self.skin.near.thickness.min()):
             trust = trust.also(f"skin is {fitted.entered * 1e3:.2f} mm inside a tool", in_range=False)
         displacement, peak, held = _within(fitted.displacement, self.layer.thickness)

@@ -21,7 +21,8 @@ ROUND_OFF = 2e-3  # largest distance of a mesh from the round solid that it is t
 LIKE = 0.1  # the same of a first guess, from which the best one is looked for
 FLAT_OFF = 1e-5  # the same of flat sides, over the radius, or a box's longest half edge; and of its volume, over that
 MOST_FITTED = 2000  # corners of a surface through which the best solid is laid
-CELLS = 8.0  # cells of a grid across a cylinder or a box, from which the grid is as good, and rounds its edges
+CELLS = 8.0  # cells of a grid across a cylinder or a box, from which the grid is as good, and rounds its edges, if they
+FINE = 7e-4  # are no larger than this [m]: flat faces are up to a third of a cell off near their edges
 NEAREST = 1e-12  # distance from an axis below which no way leads out [m]
 STEP = 1e-6  # step of the differences of a gradient [m]
 
@@ -40,8 +41,8 @@ def solid_of(vertices: Points, faces: np.ndarray, spacing: float) -> np.ndarray 
     used, corners = vertices[np.unique(faces)], vertices[faces]
     ways = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     if (numbers := _box(used, corners, ways)) is not None:
-        thin = 2 * np.linalg.norm(numbers[3:].reshape(3, 3), axis=1).min() < CELLS * spacing
-        return _packed(BOX, numbers) if thin else None
+        least = 2 * np.linalg.norm(numbers[3:].reshape(3, 3), axis=1).min()
+        return _packed(BOX, numbers) if _coarse(least, spacing) else None
     area = np.linalg.norm(ways, axis=1)
     places = 0.5 * (corners + corners[:, [1, 2, 0]]).reshape(-1, 3)
     weights = np.repeat(area / (3 * area.sum()), 3)  # with these a sum over the places is exact for squares
@@ -50,7 +51,7 @@ def solid_of(vertices: Points, faces: np.ndarray, spacing: float) -> np.ndarray 
         numbers = guess(used, places, weights)
         if not np.abs(_off(kind, numbers, used)).max() < LIKE * numbers[6] < LIKE * np.ptp(used, axis=0).max():
             continue
-        if kind == CYLINDER and not min(2 * numbers[6], np.linalg.norm(numbers[3:6] - numbers[:3])) < CELLS * spacing:
+        if kind == CYLINDER and not _coarse(min(2 * numbers[6], np.linalg.norm(numbers[3:6] - numbers[:3])), spacing):
             continue
         numbers = _through(kind, numbers, fit)
         sides = _on_side(kind, numbers, places)
@@ -61,6 +62,11 @@ def solid_of(vertices: Points, faces: np.ndarray, spacing: float) -> np.ndarray 
         if (np.abs(_off(kind, numbers, away)) < most).all():
             return _packed(kind, numbers)
     return None
+
+
+def _coarse(least: float, spacing: float) -> bool:
+    """Whether a grid is too coarse for the flat faces of a solid, whose shortest length is told [m]."""
+    return bool(least < CELLS * spacing or spacing > FINE)
 
 
 def half_of(solid: np.ndarray) -> float:

@@ -149,7 +149,7 @@ def fit_friction(toucher: Toucher | Simulator, strokes: Sequence[Contact]) -> Ru
     places = np.array([one.pose_body_from_tool[:3, 3] for one in pressing]).reshape(-1, 3)
     if not len(places) or not np.ptp(places, axis=0).any():
         return _no_friction("the tool pressed nowhere, or stood still")
-    sideways = Sideways(toucher.layer)
+    sideways = Sideways(toucher.layer.typical)
     found = [_rubbed(toucher, sideways, one) for one in pressing]
     if sum(one is not None for one in found) < MIN_INSTANTS <= len(pressing):
         return _no_friction(WRONG_WAY)

@@ -10,7 +10,8 @@ from scipy.spatial import cKDTree
 
 from benchmarks.massage_force import CIRCLE, Place, laws
 from fem_tools import IndenterFem, PatchFem, Press, RigidFem
-from stmpl_core import Contact, Load, Membrane, Ply, Simulator, SoftLayer, Tissue
+from fem_tools.axisymmetric import Flat, Profile
+from stmpl_core import Contact, Load, Membrane, Ply, Simulator, SoftLayer, Tissue, Tool
 from stmpl_core.body import Body
 from stmpl_core.bones import Bone, to_bone
 from stmpl_core.contact_net import TURNED_FROM, ContactNet, _among, _shape
@@ -24,9 +25,9 @@ from stmpl_core.regions import HELD_SKIN, region
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.state import State
 from stmpl_core.stiffness import fit_stiffness
-from stmpl_core.toucher import Toucher, tissue_doubt, unlearnt
+from stmpl_core.toucher import Toucher, soft_depth, tissue_doubt, unlearnt
 from stmpl_sim.site import Site
-from tests.scenes import at, ball, contact_of, limb, placed, punch, tool, turn
+from tests.scenes import at, ball, box, contact_of, limb, placed, plate, punch, tool, turn
 
 RADIUS, LENGTH, BALL = 0.035, 0.3, 0.015
 STACK = Tissue(3e3, 0.45, skin=Membrane(1.3e5, 1.2e-3, 11.0), deeper=(Ply(6e-3, 15e3, 0.45),))
@@ -347,6 +348,68 @@ def test_the_bound_covers_tissue_that_few_contacts_were_learnt_with(tissue: Tiss
     assert touch.trust.in_range == sound and ("over a much softer one" in touch.trust.why) != sound
     off = abs(touch.force - truth.trust.figures["probe.normal_n"])
     assert least * touch.force_bound / tissue_doubt(layer) < off < touch.force_bound
+
+
+BARE = Tissue(4e3, 0.45, deeper=(Ply(6e-3, 15e3, 0.45),))
+
+
+@pytest.mark.parametrize("tissue, beyond, sound", [(BARE, 18e-3, True), (BARE, 9e-3, False), (BARE, 6e-3, False),
+                                                   (over(4e3, 6e-3, 15e3), 9e-3, True),
+                                                   (over(4e3, 6e-3, 15e3), 4e-3, False)])  # fmt: skip
+def test_tissue_thicker_than_in_the_median_is_within_its_bound_and_flagged_where_it_matters(tissue, beyond, sound):
+    """A ball on 18 mm that are less from four thicknesses on, where finite elements of an even slab feel nothing."""
+    skin, thick = plate(0.24, 6e-3, 18e-3), 18e-3
+    far = np.clip((np.linalg.norm(skin.vertices[:, :2], axis=1) - 72e-3) / 12e-3, 0, 1)
+    layer = skin.with_(tissue=tissue, thickness=thick * (beyond / thick) ** far)
+    depths = [0.1 * thick, 0.3 * thick]
+    truths = Flat(tissue, thick).press(Profile((0.0, 0.0), (0.0, 0.0), 15e-3), depths)
+    simulator = Simulator(layer, MomentNet())
+    for depth, truth in zip(depths, truths, strict=True):
+        (touch,) = simulator.touch([contact_of(ball(15e-3, 4), at(0, 0, 15e-3 - depth))])
+        assert touch.trust.in_range == sound and ("in the median of this skin" in touch.trust.why) != sound
+        assert abs(touch.force - truth.force) < touch.force_bound
+        assert not sound or touch.force_bound < 0.2 * touch.force
+
+
+def test_how_deep_materials_begin_may_be_told_by_the_tissue_or_by_the_skin():
+    skin, told = plate(0.12, 6e-3, 18e-3), []
+    for depth, scale in ((9e-3, None), (4.5e-3, 2.0), (22.5e-3, 0.4)):
+        scales = None if scale is None else np.full(len(skin.vertices), scale)
+        layer = skin.with_(tissue=over(4e3, depth, 80e3), ply_scale=scales)
+        assert layer.typical.tissue == over(4e3, 9e-3, 80e3) and layer.typical is layer.typical
+        assert layer.typical.typical is layer.typical
+        touch = Simulator(layer, MomentNet()).touch([contact_of(ball(15e-3), at(0, 0, 10e-3))])[0]
+        told.append([touch.force, touch.force_bound])
+    np.testing.assert_allclose(told, told[:1] * 3, rtol=1e-6)
+
+
+def test_a_material_that_would_begin_below_the_bone_is_not_told_of():
+    skin = region("forearm").tissue.skin
+    layer = plate(0.12, 6e-3, 18e-3).with_(tissue=Tissue(4e3, 0.45, skin=skin))
+    deeper = [layer.with_(deeper=(Ply(30e-3, 4e5, nu),)) for nu in (0.45, 0.2)]
+    assert [unlearnt(one, 0.35, 0.46) for one in (layer, *deeper)] == [[]] * 3
+    assert soft_depth(deeper[0]) == np.inf > soft_depth(layer.with_(deeper=(Ply(10e-3, 4e5, 0.45),)))
+    assert tissue_doubt(layer) == tissue_doubt(deeper[1])
+
+
+@pytest.mark.parametrize("mesh", [box(0.03, 0.03, 0.03), box(0.06, 0.04, 0.03), punch(12e-3)],
+                         ids=["box", "plate", "disc"])  # fmt: skip
+def test_a_flat_tool_carries_the_least_force(mesh: Tool) -> None:
+    """At the first of its trials nothing presses yet, which is no tool that closes around the limb."""
+    simulator = Simulator(plate(0.16, 6e-3, 18e-3).with_(tissue=over(4e3, 6e-3, 15e3)), MomentNet())
+    depths = []
+    for force in (0.002, 0.01, 0.05):
+        wrench = np.array([0, 0, -force, 0, 0, 0])
+        (touch,) = simulator.touch([contact_of(mesh, at(0, 0, 15e-3 - 2e-4), wrench)])
+        assert touch.trust.in_range and touch.force == pytest.approx(force)
+        depths.append(touch.depth)
+    assert 0 < depths[0] < depths[1] < depths[2] < 2e-4
+
+
+def test_a_force_that_is_too_small_to_be_placed_is_not_laid_to_other_tools_where_there_are_none(simulator) -> None:
+    (touch,) = simulator.touch([pressed(2e-3, push(1e-8))])
+    assert not touch.trust.in_range and "did not settle" in touch.trust.why and "other tools" not in touch.trust.why
+    assert touch.force == pytest.approx(1e-8)
 
 
 def test_how_far_tissue_is_from_what_was_learnt() -> None:

@@ -42,6 +42,7 @@ SOLIDS = {
     "stick": (STICK, CYLINDER, lambda p: of_cylinder(p, 0.3, 2e-3), 0.4, 3e-6),
     "disc": (DISC, CYLINDER, lambda p: of_cylinder(p, 5e-3, 0.3), 0.4, 2e-4),
     "table": (box(1.0, 0.7, 0.02), BOX, lambda p: of_box(p, (1.0, 0.7, 0.02)), 0.7, 1e-12),
+    "cube": (box(0.06, 0.06, 0.06), BOX, lambda p: of_box(p, (0.06, 0.06, 0.06)), 0.1, 1e-12),
     "fine table": (FINE_TABLE, BOX, lambda p: of_box(p, (1.0, 0.7, 0.02)), 0.7, 1e-12),
 }
 
@@ -82,7 +83,7 @@ def test_the_hessian_of_a_ball_is_its_curvature() -> None:
     tool(trimesh.creation.icosphere(4, 0.012).apply_scale([1, 1, 1.01])),                       # an ellipsoid
     tool(trimesh.creation.icosphere(4, 0.012).slice_plane([0, 0, 0], [0, 0, 1], cap=True)),     # half a ball
     ball(0.012, 2),                                                                             # facets to be felt
-    box(0.03, 0.02, 0.02), tool(trimesh.creation.cylinder(0.01, 0.03, sections=64)),            # a grid knows them
+    box(0.02, 0.015, 0.015), tool(trimesh.creation.cylinder(7e-3, 0.02, sections=64)),          # a grid knows them
     tool(trimesh.util.concatenate([trimesh.creation.box((1, 0.7, 0.02)), trimesh.creation.box((0.1, 0.1, 0.06))])),
     tool(trimesh.creation.cone(0.3, 0.01, sections=96)), tool(trimesh.creation.annulus(0.2, 0.3, 0.01)),
     tool(trimesh.creation.box((1, 0.7, 0.02)).apply_transform(np.eye(4) + 0.1 * np.eye(4, k=1))),

@@ -477,6 +477,26 @@ def test_what_another_surface_of_a_name_made_relax_is_in_the_bound_until_it_is_b
     assert not later.tools
 
 
+def test_skin_that_a_tool_left_sunk_is_told_of_where_that_is_left_out_of_the_contacts(sim: Simulator) -> None:
+    deep, apart = (Contact(BALL, at(0, 0, RADIUS - depth)) for depth in (DEPTH, -1e-3))
+    state = State()
+    for _ in range(8):
+        _, state = sim.touch([deep], state, 0.5)
+    away, after = sim.touch([apart], state, 0.05)
+
+    def told(touches: list[Touch]) -> bool:
+        return "probe was left out of the contacts" in sim.answer(touches).trust.why
+
+    assert not told(away) and sim.answer(away).displacement.any()
+    for dt in (0.0, 0.05):
+        none, _ = sim.touch([], state, dt)
+        assert told(none) and not sim.answer(none).trust.in_range
+        assert not told([]), "of whom no state is told"
+    for _ in range(40):
+        _, after = sim.touch([apart], after, 60.0)
+    assert not told(sim.touch([], after, 0.05)[0]), "it is back"
+
+
 def test_an_imprint_whose_tool_was_taken_away_is_told_of(sim: Simulator) -> None:
     simulator = Simulator(sim.layer, Winkler())
     touches, _ = played(simulator, np.array([0, 0.1, 5.0, 5.01]), np.array([-1e-4, DEPTH, DEPTH, -1e-3]))

@@ -38,7 +38,8 @@ ALL_ONE_WAY = wp.constant(wp.float64(wrenches_of_skin.ALL_ONE_WAY))
 NONE = wp.constant(wp.float64(1e-300))
 NAN, PI = wp.constant(wp.float64(float("nan"))), wp.constant(wp.float64(math.pi))
 LED_DEEP, LED_LOST = (wp.constant(wp.float64(one)) for one in (toucher.LED_DEEP, toucher.LED_LOST))
-LED_OUT, LED_FROM = (wp.constant(wp.float64(one)) for one in (toucher.LED_OUT, toucher.LED_FROM))
+LED_OUT, LED_FROM, MOST_LED = (wp.constant(wp.float64(one)) for one in (toucher.LED_OUT, toucher.LED_FROM,
+                                                                        toucher.MOST_LED))  # fmt: skip
 THIN_FROM, THIN_MORE, THIN_TO, LOW = (
     wp.constant(wp.float64(one)) for one in (toucher.THIN_FROM, toucher.THIN_MORE, toucher.THIN_TO, toucher.LOW)
 )
@@ -456,8 +457,10 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
     force = force + along / wp.max(size, NONE) * force
     power, missed = _power(scratch, s, k), _missed(scratch, s, many, k)
     doubt = doubt / wp.max(size, NONE) + power * grid.surface_error / wp.max(wp.max(depth, grid.surface_error), NONE)
+    thicker = real(0.0)
     if one.stacked == 1 and forces > real(0.0):
-        unlike = known.uneven * wp.log(carried / (forces * one.flat))
+        thicker = wp.log(carried / (forces * one.flat))
+        unlike = known.uneven * thicker
         doubt = wp.sqrt(doubt * doubt + unlike * unlike)
     size += along
     sound = steep <= STEEP_SHARE * forces and long <= LONG_SHARE * forces and border <= BORDER_SHARE * forces
@@ -473,6 +476,7 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
         sound = sound and tip[1] <= TOO_DEEP
         least = LED_FROM * carried / forces
         sound = sound and (real(1.0) - led) * depth <= (real(1.0) - LED_OUT) * wp.max(depth, least)
+        sound = sound and thicker <= one.thicker[2]
         sound = sound and lack <= EDGE_OFF * wp.max(depth + lack, FIRST * carried / forces)
     wrong = real(0.0)
     if size > real(0.0) and grid.surface_error > SURE * depth:
@@ -489,8 +493,9 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
         below /= wp.max(forces, NONE)
         if one.stacked == 1:
             if led < LED_OUT:
-                bound += wp.pow(led, -power) - real(1.0)
+                bound += wp.exp(wp.min(-power * wp.log(wp.max(led, NONE)), MOST_LED)) - real(1.0)
             bound += SHELL * wp.max(-scratch.given_way[c] - SHELL_FROM, real(0.0))
+            bound += one.thicker[1] * wp.max(thicker - one.thicker[0], real(0.0))
             thin = wp.clamp(depth / wp.max(grid.half, NONE) - THIN_FROM, real(0.0), THIN_TO)
             sunk, box = way_of(scratch.top[c]), grid.high - grid.low
             high = wp.abs(sunk[1]) * box[0] + wp.abs(sunk[2]) * box[1] + wp.abs(sunk[3]) * box[2]

@@ -96,7 +96,7 @@ class Steps:
         self._mu = np.array([some.get(tool.name, every) for tool in tools])
         self._numbers = np.array([float(tool.number) for tool in tools])
         middle = [float(np.median(skin.layer.thickness)) for skin in skins]
-        series = [series_of(skin.layer.tissue, t) for skin, t in zip(skins, middle, strict=True)]
+        series = [series_of(skin.layer.typical.tissue, t) for skin, t in zip(skins, middle, strict=True)]
         self._terms = np.array([len(one.times) for one in series])
         most = int(self._terms.max())
         self.fresh = np.zeros((len(of), len(tools), size_of(most, trail=False)))
@@ -109,9 +109,9 @@ class Steps:
         fades = np.zeros((len(skins), 2 + most, RADII[-1]))
         rubs = bool((self._mu > 0).any())
         for skin, t, rows, terms in zip(skins, middle, fades, self._terms, strict=True):
-            rows[:2] = fading(skin.layer.tissue, t)
+            rows[:2] = fading(skin.layer.typical.tissue, t)
             if rubs:
-                rows[2 : 2 + terms] = fading_aside(skin.layer.tissue, t)
+                rows[2 : 2 + terms] = fading_aside(skin.layer.typical.tissue, t)
         self._tissues = [number_of(skin.layer.tissue) for skin in skins]
         self._shapes = [shape_of(skin.layer) for skin in skins]
         kinds, scenes = (np.array(one)[of].tolist() for one in (self._tissues, self._shapes))

@@ -23,7 +23,7 @@ from stmpl_core.sdf import CORNERS, MOST_CHECKS, TIPS, SignedDistance
 from stmpl_core.skin import Skin
 from stmpl_core.tool import Tool
 from stmpl_core.tools import Tools
-from stmpl_core.toucher import margin_on, soft_depth, tissue_doubt, unlearnt
+from stmpl_core.toucher import margin_on, soft_depth, thicker_than_most, tissue_doubt, unlearnt
 
 STEEP_BIT, LONG_BIT, BORDER_BIT, EDGE_BIT, BONY_BIT = 1, 2, 4, 8, 16  # what is to be said of a vertex, see Soundness
 MOST_PLACES = 8192  # places of a lattice: nodes.MOST_LOOKED_AT and a margin around them
@@ -59,6 +59,7 @@ class OneSkin:
     first_coarse: wp.int32
     first_motion: wp.int32
     flat: real
+    thicker: vec3
     effective: real
     softness: real
     soft: real
@@ -282,7 +283,8 @@ def _one_skin(skin: Skin, columns: Columns, at: tuple[int, int, int, int]) -> tu
     one.modulus, one.nu = tissue.youngs_modulus, tissue.poisson_ratio
     one.mu, one.lam = tissue.shear_modulus / one.modulus, tissue.lame_lambda / one.modulus
     known = shipped(network_of(layer)).card["ranges"]["poisson_ratio"]
-    one.learnt, one.soft, one.doubt = int(not unlearnt(layer, *known)), soft_depth(tissue), tissue_doubt(layer)
+    one.learnt, one.soft, one.doubt = int(not unlearnt(layer, *known)), soft_depth(layer), tissue_doubt(layer)
+    one.thicker = vec3(*thicker_than_most(layer))
     one.low, one.high = (vec3(*corner) for corner in where_inside(layer))
     return one, arrays
 
