@@ -123,8 +123,8 @@ def _around(vertices, areas, faces, place):
 
 def _memory(memory: Memory, before: Skin, after: Skin) -> Memory:
     trail = carried_trail(memory.trail, partial(carry_at, before, after))
-    if not memory.scalars.radius > 0:  # it never touched: where it is, it is in space
-        return memory.with_(trail=trail)
+    if not memory.scalars.radius > 0:  # it never touched: with the skin nearest to where it is
+        return memory.with_(pose=carry_at(before, after, memory.pose[:3, 3]) @ memory.pose, trail=trail)
     motion = carry_at(before, after, memory.contact[0])
     turn = motion[:3, :3]
     middle, normal, tangent = memory.contact

@@ -457,8 +457,11 @@ def part_of_way(way, normal, depth, radius, power):
 
 @numba.njit(cache=True, error_model="numpy")
 def aged(before, pose, imprint, contact, known, held, share, goes, radius, at, part, shares, times, fades, dt, elastic,
-         relaxed):  # fmt: skip
-    """What a step knows of a tool before it is known what presses.
+         relaxed, middle):  # fmt: skip
+    """What a step knows of a tool before it is known what presses, and with what it presses on then.
+
+    Its contact goes over the skin as its middle does, whatever place of the tool is there: one that rolls comes to
+    other skin, and one that turns in the air, or spins without friction, does not. Skin that sticks goes with the tool.
 
     Args:
         before, pose: poses of the tool before the step and after it, (4, 4).
@@ -472,6 +475,7 @@ def aged(before, pose, imprint, contact, known, held, share, goes, radius, at, p
         shares, times: series of the relaxation, (P,) each.
         fades: see relaxation.faded.
         dt: time of the step [s].
+        middle: middle of the contact, (3,) [m]; not numbers: not known yet, it goes as the tool does.
 
     Returns:
         twist: way of the tool, (6,) [m, rad].
@@ -483,12 +487,22 @@ def aged(before, pose, imprint, contact, known, held, share, goes, radius, at, p
     """
     kept, gain, gone, owed, now = np.empty(len(times)), np.empty(len(times)), 0.0, 0.0, 1.0
     twist, passed = twist_between(before, pose) if known else np.zeros(6), np.zeros(3)
+    went = middle - contact[0]
+    told = not np.isnan(went[0])
+    first, second = _dot(went, contact[2]), _dot(went, _cross(contact[1], contact[2]))
     if radius > 0 and held:
-        first, second = way_along(twist, contact, before)
+        tools = way_along(twist, contact, before)
+        if not told:
+            first, second = tools
         passed, over = beyond(at, first, second, PASSED * radius)
-        gone = max(share * over, over - goes) / radius
+        way, along = np.sqrt(first * first + second * second), np.sqrt(tools[0] ** 2 + tools[1] ** 2)
+        past = over / way if way > 0 else 0.0  # of its way
+        takes = min(1 - share, goes / max(past * along, 1e-300))  # of the tool's way, by the skin
+        first, second = first - takes * tools[0], second - takes * tools[1]
+        gone = past * np.sqrt(first * first + second * second) / radius
     elif radius > 0:
-        first, second = way_along(twist_between(imprint, pose), contact, imprint)
+        if not told:
+            first, second = way_along(twist_between(imprint, pose), contact, imprint)
         gone = np.sqrt(first * first + second * second) / radius
     more = faded(fades, radius)
     if part < 1:

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from stmpl_core.arrays import is_number
+from stmpl_core.arrays import check_kind, is_number
 from stmpl_core.errors import InvalidInput
 from stmpl_core.tissue import FRICTION
 
@@ -71,6 +71,8 @@ def coefficient(friction: Friction) -> float:
 def coefficients(friction: Friction | Mapping[str, Friction]) -> tuple[float, dict[str, float]]:
     """The coefficient of all tools, and those by tool's name that differ. Raises what `coefficient` raises."""
     if isinstance(friction, Mapping):
+        for name in friction:
+            check_kind("the name of a tool that friction is told of", name, str)
         return 0.0, {name: coefficient(one) for name, one in friction.items()}
     return coefficient(friction), {}
 

@@ -59,7 +59,7 @@ class History:
         self._rest = layer.typical
         self.frictions = coefficients(friction)
         thickness = float(np.median(layer.thickness))
-        self.series = series_of(layer.tissue, thickness)
+        self.series = series_of(self._rest.tissue, thickness)
         self._last: State | None = None  # state of the last step, which is one of this skin
         self._told_last: list[Touch] = []  # what that step returned
         self._skin = shape_of(layer)
@@ -168,6 +168,10 @@ class History:
     def _check(self, state: State) -> None:
         """Refuses a state of another skin; see `step`."""
         here = self.toucher.joints
+        for name, memory in state.tools.items():
+            if not isinstance(memory, Memory) or not np.isfinite(memory.numbers).all():
+                raise InvalidInput(f"the state of {name} is {memory!r:.40}; a Memory of finite numbers is needed. Try "
+                                   "an empty State().")  # fmt: skip
         if state.tools and state.joints != here:
             raise InvalidInput(f"the skin's joints are at {here} rad, the state was told at {state.joints}. Try "
                                "Simulator.touch, which takes it along.")  # fmt: skip

@@ -94,7 +94,8 @@ class Surroundings:
     def __init__(self, layer: SoftLayer) -> None:
         whole = layer
         if layer.stacked:  # to a stack, and to bone, belongs one flat response
-            layer = SoftLayer(layer.vertices, layer.faces, float(np.median(layer.thickness)), tissue=layer.tissue)
+            tissue = layer.typical.tissue
+            layer = SoftLayer(layer.vertices, layer.faces, float(np.median(layer.thickness)), tissue=tissue)
         self.frames, self.thickness = _frames(layer.normals), layer.thickness
         points = np.ascontiguousarray(layer.vertices)
         self._thinning = Thinning(layer, self.frames, REACH)

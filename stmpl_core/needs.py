@@ -193,7 +193,7 @@ def needs(
     if not isinstance(of, Tissue):
         thickness = float(np.median(of.thickness)) if thickness is None else thickness
         edge = of.edge_length if edge is None else edge
-    tissue = of if isinstance(of, Tissue) else of.tissue
+    tissue = of if isinstance(of, Tissue) else of.typical.tissue
     if thickness is None:
         raise InvalidInput("a tissue wants a thickness: give thickness=, in m.")
     thickness = one_thickness(thickness)

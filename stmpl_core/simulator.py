@@ -182,6 +182,9 @@ class Simulator:
             pressing = [touch.pressure for touch in touches if touch.pressure is not None]
         except (AttributeError, TypeError):
             raise InvalidInput(f"touches are {touches!r:.60}; a list of Touches is needed.") from None
+        if len({touch.name for touch in touches}) < len(touches):
+            raise InvalidInput("touches must be of tools of their own; got "
+                               f"{', '.join(touch.name for touch in touches)}.")  # fmt: skip
         for touch in touches:
             self._check(touch)
         pressure = sum(pressing[1:], pressing[0]) if pressing else np.zeros(len(self.layer.vertices))

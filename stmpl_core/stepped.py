@@ -113,14 +113,14 @@ def _gone(before, after, point):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _aged(parts, told, pose, part, shares, times, fades, dt):
+def _aged(parts, told, pose, part, shares, times, fades, dt, middle):
     """See footing.aged: of a tool that is at a pose (4, 4) now, and held its skin for a part of the step."""
     was, _, old, relaxed, contact, imprint, stiffness, _, _ = parts
     known, held = old[PRESSING] >= 0, old[PRESSING] > 0
     goes = old[LIMIT] / stiffness[0] if stiffness[0] > 0 else 0.0
     return aged(was if told else pose, pose, imprint if told else pose, contact, known, held, old[SHARE], goes,
-                old[RADIUS], old[PASSED : PASSED + 3], part, shares, times, fades, dt, old[ELASTIC],
-                relaxed)  # fmt: skip
+                old[RADIUS], old[PASSED : PASSED + 3], part, shares, times, fades, dt, old[ELASTIC], relaxed,
+                middle)  # fmt: skip
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -139,7 +139,8 @@ def asked_for(row, pose, wrench, shares, times, fades, dt):
     slid, size, along, way = _slid(old), 0.0, 0.0, 0.0
     if not (len(times) or slid < 1):
         return 0.0, np.nan
-    _, _, _, _, owed, now, _ = _aged(parts, old[PRESSING] > NEVER, pose, 1.0, shares, times, fades, dt)
+    unknown = np.full(3, np.nan)
+    _, _, _, _, owed, now, _ = _aged(parts, old[PRESSING] > NEVER, pose, 1.0, shares, times, fades, dt, unknown)
     for x in range(3):
         size += wrench[x] ** 2
         along += wrench[x] * contact[1, x]
@@ -173,7 +174,8 @@ def asked_again(row, pose, wrench, asked, push, forces, area, thickness, depth, 
     size = np.sqrt(size)
     if not size > 0:
         return 0.0
-    _, _, _, gain, owed, _, _ = _aged(parts, old[PRESSING] > NEVER, pose, 1.0, shares, times, fades, dt)
+    unknown = np.full(3, np.nan)
+    _, _, _, gain, owed, _, _ = _aged(parts, old[PRESSING] > NEVER, pose, 1.0, shares, times, fades, dt, unknown)
     now, more = 1.0, faded(fades, radius)
     for i in range(terms):
         now -= more * shares[i] * gain[i]
@@ -377,13 +379,16 @@ def _one(patch, before, after, grooves, shares, times, fades, has_skin, table, l
     was, wrench_before, old, relaxed, contact, _, stiffness, springs, springs_relaxed = parts
     pose, told, held = _pose_at(patch, POSE), old[PRESSING] > NEVER, old[PRESSING] > 0
     stated_pose = _pose_at(patch, STATED_POSE) if by_force or patch[BACK] > 0 else pose
-    twist, gone, kept, gain, owed, _, passed = _aged(parts, told, stated_pose, 1.0, shares, times, fades, dt)
     push, size = patch[:3].copy(), np.sqrt(patch[0] ** 2 + patch[1] ** 2 + patch[2] ** 2)
     presses, depth, power = patch[8] == HOLDS and patch[10] > 0 and size > 0, patch[9], patch[18]
+    middle = np.full(3, np.nan)  # by force it was asked for without that
+    if presses and not by_force:
+        _put(patch[11:14], middle)
+    twist, gone, kept, gain, owed, _, passed = _aged(parts, told, stated_pose, 1.0, shares, times, fades, dt, middle)
     if presses and old[PRESSING] == 0 and terms and not by_force:  # it came late in the step: from then on it relaxes
         way = -_gone(stated_pose, was, patch[11:14])
         part = part_of_way(way, push / size, depth, patch[20], power)
-        _, gone, kept, gain, owed, _, passed = _aged(parts, told, stated_pose, part, shares, times, fades, dt)
+        _, gone, kept, gain, owed, _, passed = _aged(parts, told, stated_pose, part, shares, times, fades, dt, middle)
     says[28], asked = gone, 0.0
     if presses:
         slid_before = _slid(old)

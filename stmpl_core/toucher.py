@@ -466,7 +466,7 @@ class Toucher:
             vector = wrench_of(pressure, some, layer.vertices, layer.vertex_area_vectors, pose[:3, 3],
                                layer.stacked)[0][:3]  # fmt: skip
             size = float(np.linalg.norm(vector))
-            if not size > 0:  # of a first touch, or of what is on the far side
+            if not size > 0 and (through or not pressure.any()):  # of what is on the far side, or of a first touch
                 if through:
                     high, moved = moved, 0.5 * (low + moved)
                 else:
@@ -712,8 +712,13 @@ class Toucher:
             return trust
         name, force, drag = touch.name, touch.force, touch.drag
         if stated is not None and stated[3:].any():
-            lever = float(np.linalg.norm(touch.missing[3:])) / max(force, 1e-300)
-            area = float(touch.pressed.squeeze.nodes.area.sum())
+            nodes, forces = touch.pressed.squeeze.nodes, touch.pressed.forces
+            if forces is None or not forces.any():
+                forces = nodes.area * nodes.strain
+            arm = forces @ nodes.points / forces.sum() - touch.pose_body_from_tool[:3, 3]
+            turns = touch.missing[3:] - np.cross(arm, touch.missing[:3])  # wherever the tool's own origin is
+            lever = float(np.linalg.norm(turns)) / max(force, 1e-300)
+            area = float(nodes.area.sum())
             slack = min(self.reach, float(np.subtract(*touch.pressed.field.tool_bounds[::-1]).max()))
             if lever > max(MAX_LEVER * (area / np.pi) ** 0.5, slack):
                 trust = trust.also(f"{name} also turns with {1e3 * force * lever:.2g} N mm, which is not carried",

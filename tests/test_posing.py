@@ -291,6 +291,19 @@ def test_a_tool_that_rides_on_the_limb_does_not_slide_and_one_that_stays_in_spac
     assert forces[False][0] > 0.3 * forces[False][1]
 
 
+def test_a_tool_that_rides_above_the_limb_touches_it_without_friction():
+    """Nor does it matter whether it ever touched before."""
+    layer = long_limb()
+    skin, tool, state = Skin.of(layer.with_(rig=hinged(layer)), MomentNet()), ball(), State()
+    simulator, vertex = Simulator(skin, friction=0.4), near(layer, (0, RADIUS, 0.20))
+    for angle, depth in ((0.0, -1e-3), (0.05, -1e-3), (0.05, 2e-3)):
+        state = simulator.pose({"elbow": angle}, state)
+        pose = skin.layer.rig.motions((angle,))[1] @ pressed(layer, vertex, depth)
+        touches, state = simulator.touch([Contact(tool, pose)], state, 0.05)
+    assert touches[0].slip is not None and touches[0].force > 0
+    assert np.linalg.norm(touches[0].slip.wrench[:3]) < 0.02 * touches[0].force
+
+
 def test_the_same_way_over_a_moving_skin_is_the_same_to_the_last_bit(skin):
     def run() -> bytes:
         simulator, state, tool = Simulator(skin, friction=0.4), State(), ball()

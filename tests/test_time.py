@@ -12,7 +12,7 @@ from stmpl_core.relaxation import depth_left, fades_under, series_of
 from stmpl_core.stack import ball as pressed_ball
 from stmpl_core.state import UNKNOWN, VERSION, Scalars, fresh
 from stmpl_core.touch import APART, BY_POSE, MOVED, TOUCHING
-from tests.scenes import at, ball, plate
+from tests.scenes import at, ball, plate, turn
 
 SERIES = Prony((0.225, 0.225), (0.5, 5.0))
 RADIUS, DEPTH = 8e-3, 3e-3
@@ -475,6 +475,39 @@ def test_what_another_surface_of_a_name_made_relax_is_in_the_bound_until_it_is_b
         assert touch.force_bound > held.force_bound + 0.5 * (same.force - held.force)
     _, later = sim.touch([], later, 1e4)
     assert not later.tools
+
+
+def test_a_ball_that_rolls_comes_to_fresh_skin_and_one_that_spins_without_friction_or_turns_in_the_air_does_not(sim):
+    """Whatever place of the tool is at the contact: without friction a ball does not feel how it is turned."""
+
+    def after(way: float, angle: float, lift: float = 0.0) -> float:
+        deep, state = DEPTH, State()
+        (_, state), steps = sim.touch([pressed(deep)], state, 0.0), 20
+        _, state = sim.touch([pressed(deep)], state, 100.0)
+        if lift:
+            _, state = sim.touch([pressed(-lift)], state, 0.01)
+        for k in range(1, steps + 1):
+            pose = turn((0, 1, 0), angle * k / steps, (MIDDLE[0] + way * k / steps, MIDDLE[1], RADIUS - deep + lift))
+            (touch,), state = sim.touch([Contact(BALL, pose)], state, 0.01)
+        if lift:
+            pose = turn((0, 1, 0), angle, (MIDDLE[0] + way, MIDDLE[1], RADIUS - deep))
+            (touch,), _ = sim.touch([Contact(BALL, pose)], state, 0.01)
+        return touch.force
+
+    still, slides, back = after(0.0, 0.0), after(0.02, 0.0), after(0.0, 0.0, 1e-3)
+    assert slides > 1.4 * still
+    assert after(0.02, 0.02 / RADIUS) == pytest.approx(slides, rel=0.02)
+    assert after(0.0, 1.5) == pytest.approx(still, rel=0.02)
+    assert after(0.0, 1.5, 1e-3) == pytest.approx(back, rel=0.02)
+
+
+def test_a_state_that_is_none_or_not_finite_is_refused(sim: Simulator) -> None:
+    _, state = sim.touch([pressed(DEPTH)], State(), 0.1)
+    memory = state.tools[BALL.name]
+    broken = memory.with_(pose=np.full((4, 4), np.nan))
+    for one in (3, broken):
+        with pytest.raises(InvalidInput, match=f"state of {BALL.name} is .*finite numbers is needed"):
+            sim.touch([pressed(DEPTH)], State({BALL.name: one}), 0.1)  # type: ignore[dict-item]
 
 
 def test_skin_that_a_tool_left_sunk_is_told_of_where_that_is_left_out_of_the_contacts(sim: Simulator) -> None:

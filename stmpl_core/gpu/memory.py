@@ -120,7 +120,7 @@ class Steps:
         self._series = shares, times, fades
         self._skins = np.array([float(skin.layer.tissue.skin is not None) for skin in skins])
         self.gives, self.bends = _along_skin(skins) if rubs else (np.empty((0, 3, 3)), np.empty((0, 3, 3)))
-        aside = [Sideways(skin.layer) for skin in skins] if rubs else []
+        aside = [Sideways(skin.layer.typical) for skin in skins] if rubs else []
         wide = max((len(one._table) for one in aside), default=1)
         self._tables = np.zeros((len(skins), wide, len(aside[0]._logs) if rubs else 1, 3))
         self._logs, self._sizes = np.zeros((len(skins), wide + self._tables.shape[2])), np.zeros((len(skins), 3))
