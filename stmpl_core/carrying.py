@@ -40,8 +40,14 @@ def carried(state: State, skin: Skin, after: Skin) -> State:
     """
     if not isinstance(state, State):
         raise InvalidInput(f"the state is {state!r:.40}; a State is needed, State() at the beginning.")
+    for name, memory in state.tools.items():
+        if not isinstance(memory, Memory):
+            raise InvalidInput(f"the state of {name} is {memory!r:.40}; a Memory is needed. Try an empty State().")
     if state.joints == after.angles:
         return state
+    if not state.finite:
+        raise InvalidInput(f"the state of {', '.join(state.tools)} has numbers that are not finite. Try an empty "
+                           "State().")  # fmt: skip
     if not state.tools:
         return replace(state, joints=after.angles)
     rig = (after.rest or after).layer.rig
@@ -94,7 +100,7 @@ def _around(vertices, areas, faces, place):
         square[v] = 0.0
         for x in range(3):
             square[v] += (vertices[v, x] - place[x]) ** 2
-        if square[v] < square[nearest]:
+        if areas[v] > 0 and (square[v] < square[nearest] or not areas[nearest] > 0):
             nearest = v
     unit = 2 * WINDOW**2 * areas[nearest]
     some = np.flatnonzero(square < square[nearest] + MOST_EXPONENT * unit)

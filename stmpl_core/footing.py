@@ -494,12 +494,10 @@ def aged(before, pose, imprint, contact, known, held, share, goes, radius, at, p
         tools = way_along(twist, contact, before)
         if not told:
             first, second = tools
-        passed, over = beyond(at, first, second, PASSED * radius)
-        way, along = np.sqrt(first * first + second * second), np.sqrt(tools[0] ** 2 + tools[1] ** 2)
-        past = over / way if way > 0 else 0.0  # of its way
-        takes = min(1 - share, goes / max(past * along, 1e-300))  # of the tool's way, by the skin
-        first, second = first - takes * tools[0], second - takes * tools[1]
-        gone = past * np.sqrt(first * first + second * second) / radius
+        along = np.sqrt(tools[0] ** 2 + tools[1] ** 2)
+        takes = min(1 - share, goes / max(along, 1e-300))  # of the tool's way, by the skin
+        passed, over = beyond(at, first - takes * tools[0], second - takes * tools[1], PASSED * radius)
+        gone = over / radius
     elif radius > 0:
         if not told:
             first, second = way_along(twist_between(imprint, pose), contact, imprint)

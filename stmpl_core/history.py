@@ -88,7 +88,7 @@ class History:
     def moved(self, toucher: Toucher) -> History:
         """The same history where joints take the skin."""
         out = copy(self)
-        out.toucher, out._last = toucher, None
+        out.toucher, out._last, out._told_last = toucher, None, []
         for name in ("_box", "_gives"):
             out.__dict__.pop(name, None)
         return out
@@ -160,7 +160,8 @@ class History:
 
     def left_out(self, touches: Sequence[Touch]) -> list[str]:
         """Tools whose skin is not back yet and that were not among the contacts, if the last step returned these."""
-        if touches is not self._told_last or self._last is None:
+        if self._last is None or not len(self.series.times) or len(touches) != len(self._told_last) \
+                or any(one is not told for one, told in zip(touches, self._told_last, strict=True)):
             return []
         names = {touch.name for touch in touches}
         return [name for name, memory in self._last.tools.items() if name not in names and memory.sunk]
@@ -169,9 +170,8 @@ class History:
         """Refuses a state of another skin; see `step`."""
         here = self.toucher.joints
         for name, memory in state.tools.items():
-            if not isinstance(memory, Memory) or not np.isfinite(memory.numbers).all():
-                raise InvalidInput(f"the state of {name} is {memory!r:.40}; a Memory of finite numbers is needed. Try "
-                                   "an empty State().")  # fmt: skip
+            if not np.isfinite(memory.numbers).all():
+                raise InvalidInput(f"the state of {name} has numbers that are not finite. Try an empty State().")
         if state.tools and state.joints != here:
             raise InvalidInput(f"the skin's joints are at {here} rad, the state was told at {state.joints}. Try "
                                "Simulator.touch, which takes it along.")  # fmt: skip

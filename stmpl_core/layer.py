@@ -91,7 +91,9 @@ class SoftLayer:
         if self.bony is not None and self.bony.shape != (len(self.vertices),):
             raise InvalidInput(f"bony has shape {self.bony.shape}, the skin has {len(self.vertices)} vertices.")
         self.chart, self.rig = chart, rig
-        self._typical: tuple[SoftLayer, SoftLayer] | None = None
+        middle = 1.0 if self.ply_scale is None else float(np.median(self.ply_scale))
+        self._middle = 1.0 if abs(middle - 1) < AS_TOLD else middle
+        self._typical: SoftLayer | None = None
         if rig is not None and not hasattr(rig, "weights"):
             raise InvalidInput(f"rig is {rig!r:.40}; Rig or None is needed.")
         if rig is not None and len(rig.weights) != len(self.vertices):
@@ -142,6 +144,7 @@ class SoftLayer:
                          "vertex_area_vectors": vertex_area_vectors, "vertex_areas": vertex_areas,
                          "normals": normals}  # fmt: skip
         out.vertices, out.core, out.chart, out.rig = vertices, core, None, None  # a rig knows the rest alone
+        out._typical = None
         if core is not None:
             out.thickness = out._depth_of_core()
         return out
@@ -154,14 +157,14 @@ class SoftLayer:
     @property
     def typical(self) -> SoftLayer:
         """The same layer with depths of deeper materials as they are in the median: `ply_scale` about 1. Made once."""
-        middle = 1.0 if self.ply_scale is None else float(np.median(self.ply_scale))
-        if abs(middle - 1) < AS_TOLD:
+        if self._middle == 1:
             return self
-        if self._typical is None or self._typical[0] is not self:  # of which this is a copy
-            deeper = tuple(replace(ply, depth=middle * ply.depth) for ply in self.tissue.deeper)
-            self._typical = self, self.with_(tissue=replace(self.tissue, deeper=deeper),
-                                             ply_scale=np.asarray(self.ply_scale) / middle)  # fmt: skip
-        return self._typical[1]
+        if self._typical is None:
+            deeper = tuple(replace(ply, depth=self._middle * ply.depth) for ply in self.tissue.deeper)
+            out = self._typical = copy(self)
+            out.tissue, out._middle = replace(self.tissue, deeper=deeper), 1.0
+            out.ply_scale = np.asarray(self.ply_scale) / self._middle
+        return self._typical
 
     @property
     def below(self) -> dict[str, np.ndarray]:

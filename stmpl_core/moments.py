@@ -203,13 +203,14 @@ class Surroundings:
     @classmethod
     def of(cls, layer: SoftLayer) -> Surroundings:
         """The surroundings of a layer, made on the first call and kept as long as the layer is."""
+        layer = layer.typical
         if layer not in _KEPT:
             _KEPT[layer] = cls(layer)
         return _KEPT[layer]
 
     def keep(self, layer: SoftLayer) -> None:
         """Lets `of` give these for another layer of the same shape and Poisson's ratio."""
-        _KEPT[layer] = self
+        _KEPT[layer.typical] = self
 
     def sinking(self, vertices: np.ndarray) -> np.ndarray:
         """Sinking of vertex i under a unit source at vertex j of those given, over t, (N, N) [-]."""

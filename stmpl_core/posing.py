@@ -110,7 +110,7 @@ def keep_green(rest: Skin, layer: SoftLayer, near: Surroundings, angles: Sequenc
         layer, near: layer where its joints took it, and its neighbours.
         angles: angle of each joint of the rig there [rad].
     """
-    there, rig = copy(layer), rest.layer.rig
+    there, rig = copy(layer.typical), rest.layer.rig
     assert rig is not None
 
     def make() -> Green:

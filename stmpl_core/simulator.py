@@ -174,8 +174,6 @@ class Simulator:
         Raises:
             InvalidInput: touches of another skin, or made where its joints were elsewhere.
         """
-        left_out = self.history.left_out(touches)
-
         # Sum: pressures of several tools add.
         try:
             touches = list(touches)
@@ -187,6 +185,7 @@ class Simulator:
                                f"{', '.join(touch.name for touch in touches)}.")  # fmt: skip
         for touch in touches:
             self._check(touch)
+        left_out = self.history.left_out(touches)
         pressure = sum(pressing[1:], pressing[0]) if pressing else np.zeros(len(self.layer.vertices))
         moves = self.history.elastic(touches)
 
@@ -208,8 +207,8 @@ class Simulator:
                 trust = trust.also(f"{touch.name} was taken away: the skin that it left sunk is shown at rest",
                                    in_range=False)  # fmt: skip
         if left_out:
-            trust = trust.also(f"{', '.join(left_out)} was left out of the contacts: the skin that it left sunk is "
-                               "shown at rest. Keep it among them, away from the skin", in_range=False)  # fmt: skip
+            trust = trust.also(f"{', '.join(left_out)} was left out of the contacts: skin that it pressed is not back "
+                               "yet, and is shown at rest. Keep a tool among them until it is", in_range=False)
         if fitted.entered > MAX_ENTERED_SHARE * float(self.skin.near.thickness.min()):
             trust = trust.also(f"skin is {fitted.entered * 1e3:.2f} mm inside a tool", in_range=False)
         displacement, peak, held = _within(fitted.displacement, self.layer.thickness)

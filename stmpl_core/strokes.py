@@ -316,7 +316,7 @@ def fit_relaxation(toucher: Toucher | Simulator, press: Sequence[Contact], relax
     layer, steps = toucher.layer, np.diff([one.time for one in press])
     if (steps <= 0).any() or not np.isfinite(steps).all():
         raise InvalidInput("the times of a press must go forward; relaxation is a matter of time.")
-    tissue, thickness = layer.tissue.relaxing(taken), float(np.median(layer.thickness))
+    tissue, thickness = layer.typical.tissue.relaxing(taken), float(np.median(layer.thickness))
     (shares, times), fades = series_of(tissue, thickness), fading(tissue, thickness)
     relaxed, kept, gain, before = np.zeros(len(times)), np.empty(len(times)), np.empty(len(times)), 0.0
     rows, forces, when, more, middle, free = [], [], [], [], None, False

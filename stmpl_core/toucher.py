@@ -608,8 +608,8 @@ class Toucher:
                                f"its walls, and goes along by {led:.0%} of that", in_range=False)  # fmt: skip
         if thicker > self._thicker.most:
             trust = trust.also(f"tissue under {touch.name} is {1e3 * thickness:.2g} mm thick, {math.exp(thicker):.2g} "
-                               "times what it is in the median of this skin, which is taken for all: give a part "
-                               "that is more even", in_range=False)  # fmt: skip
+                               "times what it is in the median of this skin, whose response is taken for all of it: "
+                               "give a part that is more even", in_range=False)  # fmt: skip
         if missed > UNSOLVED:
             trust = trust.also(f"where {touch.name} presses was not found: skin misses it by {missed:.0%} of its depth",
                                in_range=False, converged=False)  # fmt: skip
@@ -714,7 +714,7 @@ class Toucher:
         if stated is not None and stated[3:].any():
             nodes, forces = touch.pressed.squeeze.nodes, touch.pressed.forces
             if forces is None or not forces.any():
-                forces = nodes.area * nodes.strain
+                forces = nodes.area
             arm = forces @ nodes.points / forces.sum() - touch.pose_body_from_tool[:3, 3]
             turns = touch.missing[3:] - np.cross(arm, touch.missing[:3])  # wherever the tool's own origin is
             lever = float(np.linalg.norm(turns)) / max(force, 1e-300)
@@ -922,9 +922,8 @@ def over_soft(layer: SoftLayer) -> float:
     By finite elements (balls of 25 to 80 mm, 0.2 to 0.7 of the thickness deep): what a skin over 12 kPa of 10 mm over
     4 kPa presses with is 9 to 14 % too much, over 20 kPa of 8 mm over 2 kPa 32 to 41 %.
     """
-    tissue, thickness = layer.typical.tissue, float(layer.thickness.max())
-    plies = [(0.0, tissue.youngs_modulus)]
-    plies += [(ply.depth, ply.youngs_modulus) for ply in tissue.deeper if ply.depth < thickness]
+    thickness, plies = float(np.median(layer.thickness)), [(0.0, layer.tissue.youngs_modulus)]
+    plies += [(ply.depth, ply.youngs_modulus) for ply in _there(layer.typical)]
     most, (at_skin, inside, from_here) = 0.0, OVER_SOFT
     for k, (depth, stiff) in enumerate(plies[:-1]):
         each = np.interp(depth / thickness, [0.0, from_here], [at_skin, inside])

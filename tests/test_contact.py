@@ -119,6 +119,19 @@ def test_the_depth_of_a_tool_that_is_apart_says_how_far_it_is_away(sim: Simulato
         assert np.isnan(touch.depth)
 
 
+@pytest.mark.parametrize("turns, said", [(0.0, False), (0.05, True)])
+def test_a_torque_that_is_not_carried_is_told_of_wherever_the_tools_own_frame_is(toucher: Toucher, turns, said) -> None:
+    """Without friction 0.2 N along the skin are not carried either, and turn about a flange 0.3 m away."""
+    for away in (0.0, 0.3):
+        mesh = Tool("probe", BALL.vertices + [away, 0, 0], BALL.faces)
+        pose, force = on_limb(2e-3), np.array([-0.3, 0.1, 0.0])
+        arm = pose[:3, 3] - (pose[:3, 3] - [away, 0, 0])
+        pose[:3, 3] -= [away, 0, 0]
+        wrench = np.concatenate([force, np.cross(arm, force) + [0, 0, turns]])
+        touch = toucher.touch(Contact(mesh, pose, wrench))
+        assert ("also turns with" in touch.trust.why) == said, touch.trust.why
+
+
 def test_a_force_however_small_is_placed(toucher: Toucher) -> None:
     touch = felt(toucher, BALL, on_limb(2e-3), (-1e-12, 0, 0))
     assert touch.trust.in_range and touch.force == pytest.approx(1e-12) and abs(touch.depth) < 1e-5

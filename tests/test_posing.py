@@ -26,6 +26,7 @@ from stmpl_core.methods import Coarse, Linear, MomentNet, Winkler
 from stmpl_core.methods import method as method_named
 from stmpl_core.methods.base import anew
 from stmpl_core.nodes import Nodes
+from stmpl_core.posing import posed
 from stmpl_core.rig import Joint, Rig
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.soundness import HOLLOW
@@ -289,6 +290,16 @@ def test_a_tool_that_rides_on_the_limb_does_not_slide_and_one_that_stays_in_spac
         forces[rides] = np.linalg.norm(touches[0].slip.wrench[:3]), touches[0].force
     assert forces[True][0] < 0.02 * forces[True][1]
     assert forces[False][0] > 0.3 * forces[False][1]
+
+
+def test_how_deep_materials_begin_is_taken_into_the_tissue_of_skin_that_is_bent_into_folds():
+    layer = long_limb()
+    layer = layer.with_(tissue=Tissue(4e3, 0.45, deeper=(Ply(6e-3, 15e3, 0.45),)), rig=hinged(layer),
+                        ply_scale=np.full(len(layer.vertices), 0.5))  # fmt: skip
+    bent = posed(layer, (2.0,))
+    assert bent.typical is bent.typical and bent.typical.tissue.deeper[0].depth == 3e-3
+    np.testing.assert_array_equal(bent.typical.vertices, bent.vertices)
+    np.testing.assert_array_equal(bent.typical.ply_scale, 1.0)
 
 
 def test_a_tool_that_rides_above_the_limb_touches_it_without_friction():

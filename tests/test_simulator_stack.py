@@ -377,7 +377,7 @@ def test_how_deep_materials_begin_may_be_told_by_the_tissue_or_by_the_skin():
         scales = None if scale is None else np.full(len(skin.vertices), scale)
         layer = skin.with_(tissue=over(4e3, depth, 80e3), ply_scale=scales)
         assert layer.typical.tissue == over(4e3, 9e-3, 80e3) and layer.typical is layer.typical
-        assert layer.typical.typical is layer.typical
+        assert layer.typical.typical is layer.typical and Surroundings.of(layer) is Surroundings.of(layer.typical)
         answer = Simulator(layer, MomentNet()).step([contact_of(ball(15e-3), at(0, 0, 10e-3))])
         touch = answer.touches["probe"]
         told.append([touch.force, touch.force_bound, *answer.displacement.ravel()])
