@@ -45,9 +45,7 @@ def carried(state: State, skin: Skin, after: Skin) -> State:
             raise InvalidInput(f"the state of {name} is {memory!r:.40}; a Memory is needed. Try an empty State().")
     if state.joints == after.angles:
         return state
-    if not state.finite:
-        raise InvalidInput(f"the state of {', '.join(state.tools)} has numbers that are not finite. Try an empty "
-                           "State().")  # fmt: skip
+    state.check_finite()
     if not state.tools:
         return replace(state, joints=after.angles)
     rig = (after.rest or after).layer.rig

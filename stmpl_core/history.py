@@ -169,9 +169,7 @@ class History:
     def _check(self, state: State) -> None:
         """Refuses a state of another skin; see `step`."""
         here = self.toucher.joints
-        for name, memory in state.tools.items():
-            if not np.isfinite(memory.numbers).all():
-                raise InvalidInput(f"the state of {name} has numbers that are not finite. Try an empty State().")
+        state.check_finite()
         if state.tools and state.joints != here:
             raise InvalidInput(f"the skin's joints are at {here} rad, the state was told at {state.joints}. Try "
                                "Simulator.touch, which takes it along.")  # fmt: skip

@@ -196,6 +196,12 @@ class State:
         """Whether every number of it is finite."""
         return all(np.isfinite(memory.numbers).all() for memory in self.tools.values())
 
+    def check_finite(self) -> None:
+        """Raises InvalidInput where a number of it is not finite."""
+        if not self.finite:
+            raise InvalidInput(f"the state of {', '.join(self.tools)} has numbers that are not finite. Try an empty "
+                               "State().")  # fmt: skip
+
     def without(self, name: str) -> State:
         """The state without what it remembers of a tool: the skin that it pressed is at rest."""
         return replace(self, tools={other: memory for other, memory in self.tools.items() if other != name})

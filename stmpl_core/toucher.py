@@ -455,11 +455,7 @@ class Toucher:
             if not (self._inward[v] @ push > MIN_FACING_COSINE).any() or not len(squeeze.nodes.area):
                 if best is None and gap == 0.0 and len(squeeze.nodes.area):
                     return None
-                if through:
-                    high, moved = moved, 0.5 * (low + moved)
-                    continue
-                low = max(low, moved)
-                moved += 0.05 * self._thickest if not np.isfinite(high) else 0.5 * (high - moved)
+                low, moved, high = _elsewhere(low, moved, high, through, 0.05 * self._thickest)
                 continue
             held = self.net.hold(squeeze.nodes)
             some, pressure = squeeze.nodes.at_vertices(held.pressure * self._modulus, layer.vertex_areas)
@@ -467,10 +463,7 @@ class Toucher:
                                layer.stacked)[0][:3]  # fmt: skip
             size = float(np.linalg.norm(vector))
             if not size > 0 and (through or not pressure.any()):  # of what is on the far side, or of a first touch
-                if through:
-                    high, moved = moved, 0.5 * (low + moved)
-                else:
-                    low, moved = moved, moved + 0.05 * self._thickest if not np.isfinite(high) else 0.5 * (moved + high)
+                low, moved, high = _elsewhere(low, moved, high, through, 0.05 * self._thickest)
                 continue
             wrapped = size <= MIN_NET_FORCE_SHARE * float(pressure @ layer.vertex_areas[some])
             if wrapped and not through:
@@ -726,6 +719,13 @@ class Toucher:
         if drag > MAX_DRAG_RATIO * force:
             trust = trust.also(f"{name} also drags with {drag:.2g} N, which is not carried", in_range=False)
         return trust
+
+
+def _elsewhere(low: float, moved: float, high: float, through: bool, step: float) -> tuple[float, float, float]:
+    """Bracket and next trial where nothing presses: the tool has gone `through` the limb, or is not deep enough."""
+    if through:
+        return low, 0.5 * (low + moved), moved
+    return max(low, moved), moved + (0.5 * (high - moved) if math.isfinite(high) else step), high
 
 
 def _strained(trials: Sequence[tuple[float, float]], squeeze: Squeeze) -> float:
