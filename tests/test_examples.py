@@ -12,7 +12,7 @@ NUMBERS = {  # what main() returns; its docstring says what that is
     "03_touch_with_a_force": 3.34e-3,  # m
     "04_two_fingers": 1.477e-3,  # m
     "05_your_own_method": 0.199,
-    "06_judge_a_recording": 4.77e-5,  # m
+    "06_judge_a_recording": 4.33e-5,  # m
     "07_how_stiff_is_it": 1400.0,  # Pa
     "08_a_haptic_loop": 0.0306,  # N
     "09_press_evenly": 9.63e-3,  # m
