@@ -432,8 +432,13 @@ def way_along(twist, contact, pose):
     """Way along the skin, by its two tangents [m], of the place of a tool that was in the middle of its contact;
     contact: see Memory.
     """
-    go = twist[:3] + swung(twist[3:], contact[0] - pose[:3, 3], 1.0)
-    return _dot(go, contact[2]), _dot(go, _cross(contact[1], contact[2]))
+    return along_tangents(twist[:3] + swung(twist[3:], contact[0] - pose[:3, 3], 1.0), contact)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def along_tangents(vector, contact):
+    """What of a vector (3, .) is along the two tangents of a contact, see Memory."""
+    return _dot(vector, contact[2]), _dot(vector, _cross(contact[1], contact[2]))
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -456,8 +461,8 @@ def part_of_way(way, normal, depth, radius, power):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def aged(before, pose, imprint, contact, known, held, share, goes, radius, at, part, shares, times, fades, dt, elastic,
-         relaxed, middle):  # fmt: skip
+def aged(before, pose, imprint, contact, known, held, share, goes, along, radius, at, part, shares, times, fades, dt,
+         elastic, relaxed, middle):  # fmt: skip
     """What a step knows of a tool before it is known what presses, and with what it presses on then.
 
     Its contact goes over the skin as its middle does, whatever place of the tool is there: one that rolls comes to
@@ -470,6 +475,8 @@ def aged(before, pose, imprint, contact, known, held, share, goes, radius, at, p
         held: whether it pressed.
         share, radius, elastic: see Scalars.
         goes: way that skin goes along with the tool until all of it slides [m].
+        along: way that it goes in the step by the friction that is told, by the tangents, (2,) [m]; not numbers: by
+            pose, which tells none.
         at: where the contact is in the room that it has slid over, see `beyond`, (3,) [m].
         part: share of the step, its end, in which skin is held [-]; before that it is free.
         shares, times: series of the relaxation, (P,) each.
@@ -487,15 +494,16 @@ def aged(before, pose, imprint, contact, known, held, share, goes, radius, at, p
     """
     kept, gain, gone, owed, now = np.empty(len(times)), np.empty(len(times)), 0.0, 0.0, 1.0
     twist, passed = twist_between(before, pose) if known else np.zeros(6), np.zeros(3)
-    went = middle - contact[0]
-    told = not np.isnan(went[0])
-    first, second = _dot(went, contact[2]), _dot(went, _cross(contact[1], contact[2]))
+    told = not np.isnan(middle[0])
+    first, second = along_tangents(middle - contact[0], contact)
     if radius > 0 and held:
         tools = way_along(twist, contact, before)
         if not told:
             first, second = tools
-        along = np.sqrt(tools[0] ** 2 + tools[1] ** 2)
-        takes = min(1 - share, goes / max(along, 1e-300))  # of the tool's way, by the skin
+        square = tools[0] ** 2 + tools[1] ** 2
+        takes = min(1 - share, goes / max(np.sqrt(square), 1e-300))  # of the tool's way, by the skin
+        if not np.isnan(along[0]):
+            takes = min(max((along[0] * tools[0] + along[1] * tools[1]) / max(square, 1e-300), 0.0), 1.0)
         passed, over = beyond(at, first - takes * tools[0], second - takes * tools[1], PASSED * radius)
         gone = over / radius
     elif radius > 0:

@@ -24,7 +24,7 @@ from stmpl_core.friction import Friction, coefficients
 from stmpl_core.green import AS_AT_REST, Green
 from stmpl_core.layer import SoftLayer
 from stmpl_core.relaxation import fading, series_of
-from stmpl_core.sideways import Sideways, fading_aside
+from stmpl_core.sideways import Sideways, beside, fading_aside
 from stmpl_core.slip import MOST_GROWN
 from stmpl_core.state import Memory, State, fresh
 from stmpl_core.stepped import MOST_DRAGGED, OUT, PATCH, SAYS
@@ -36,6 +36,7 @@ from stmpl_core.wake import Wake
 
 ELSEWHERE = 3.0  # thicknesses around a skin within which a contact on it lies, whatever presses
 FLAT = np.zeros((1, 1, 3)), np.zeros(1), np.zeros(1), 0.0, 0.0  # in place of a Sideways where nothing rubs
+ALONE = np.zeros((1, 1, 2))  # in place of a table of sideways.beside where a tool is alone, or nothing rubs
 NO_GIVES = AS_AT_REST, AS_AT_REST  # in place of Green.gives
 
 
@@ -112,6 +113,10 @@ class History:
         return self.sideways.numbers if self.rubs else FLAT
 
     @cached_property
+    def _beside(self) -> np.ndarray:
+        return beside(self._rest.tissue, float(np.median(self._rest.thickness)))
+
+    @cached_property
     def _gives(self) -> tuple[np.ndarray, np.ndarray]:
         """See Green.gives."""
         return Green.of(self.toucher.layer).gives
@@ -143,8 +148,9 @@ class History:
         for patch, (stated, one, touch) in zip(patches, rows, strict=True):
             self._tell(patch, stated, one is not stated, touch)
         out, says = np.empty((many, OUT)), np.zeros((many, SAYS))
+        near = self._beside if self.rubs and len(before) > 1 else ALONE
         plain = stepped.step(patches, before, after, True, *self.series, self._fades,
-                             self.toucher.layer.tissue.skin is not None, *self._aside, dt, out, says)  # fmt: skip
+                             self.toucher.layer.tissue.skin is not None, *self._aside, near, dt, out, says)  # fmt: skip
         memories = {name: Memory(row) for name, row in zip(names, after, strict=True)}
         touches = [self._told(*one) for one in zip(contacts, touches, memories.values(), out, says, strict=False)]
         if terms and not (plain and all(touch.trust.in_range for touch in touches)):
@@ -216,7 +222,7 @@ class History:
                 nodes = pressed.squeeze.nodes
                 by = stepped.asked_again(
                     before[k], stated.pose_body_from_tool, stated.wrench, one.wrench, touch.push, pressed.forces,
-                    nodes.area, nodes.thickness, touch.depth, shares, times, fades, dt)  # fmt: skip
+                    nodes.points, nodes.area, nodes.thickness, touch.depth, shares, times, fades, dt)  # fmt: skip
                 if by:
                     asked[k], fits = one.scaled(by), False
         if fits:
@@ -270,7 +276,7 @@ class History:
                 share, turn, grown, slid_turn, dragged = told[10], told[14], told[18], told[22], told[26]
                 own = says.copy()
                 changed["slip"] = Slip(own[4:10], share, own[11:14], turn, own[23:26], own[15:18], grown, own[19:22],
-                                       slid_turn)  # fmt: skip
+                                       slid_turn, own[stepped.TAKEN :])  # fmt: skip
                 if grown >= MOST_GROWN and contact.wrench is None:
                     trust = trust.also(
                         f"{touch.name} drags skin around the limb, which would press {grown - 1:.0%} harder than "
@@ -310,11 +316,11 @@ class History:
         for touch in touches:
             if touch.imprint is not None:
                 continue
-            if touch.slip is None or np.linalg.norm(touch.slip.offset) <= MIN_OFFSET or \
-                    touch.name not in self.toucher.tools:  # fmt: skip
+            way = np.zeros(3) if touch.slip is None else touch.slip.offset + touch.slip.taken
+            if np.linalg.norm(way) <= MIN_OFFSET or touch.name not in self.toucher.tools:
                 out.append(touch)
             else:
-                pose = shifted(touch.pose_body_from_tool, -touch.slip.offset)
+                pose = shifted(touch.pose_body_from_tool, -way)
                 asked.append(Contact(self.toucher.tools[touch.name], pose))
         return [*out, *self.toucher.touch_all(asked)]
 
@@ -355,7 +361,7 @@ def compile_steps() -> None:
     patches, after, out, says = np.zeros((1, PATCH)), np.empty_like(before), np.zeros((1, OUT)), np.zeros((1, SAYS))
     stepped.asked_for(before[0], pose, wrench, *series, fades, dt)
     stepped.tell(wrench, 0.0, True, 0.0, pose, wrench, pose, False, False, 0.0, 0.0, patches[0])
-    stepped.step(patches, before, after, True, *series, fades, True, *FLAT, dt, out, says)
+    stepped.step(patches, before, after, True, *series, fades, True, *FLAT, ALONE, dt, out, says)
     stepped.doubted(before, after, *series, dt, np.zeros(1), out, says)
 
 

@@ -28,6 +28,7 @@ import numpy as np
 from stmpl_core.footing import (
     along_aim,
     along_give,
+    along_tangents,
     carried_more,
     faced,
     given_way,
@@ -365,8 +366,9 @@ def _find(wanted, stiffness, cap, start, left, over, springs, force, slides, go)
 
 @numba.njit(cache=True, error_model="numpy")
 def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself, wrap, force, lever, elastic, depth,
-        radius, thickness, power, along, turn, bare, slack, twist, known, pressed, before_contact, before_elastic,
-        before_slid, before_held, first, room, passed, springs, relaxed, stiffness, shares, times, dt):  # fmt: skip
+        radius, thickness, power, along, turn, bare, slack, twist, taken, known, pressed, before_contact,
+        before_elastic, before_slid, before_held, first, room, passed, springs, relaxed, stiffness, shares, times,
+        dt):  # fmt: skip
     """Friction of a contact that would press with a wrench (6,) without friction.
 
     Friction turns the way that the push faces, and the push bounds friction: both are asked until they agree.
@@ -389,6 +391,7 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
         thickness: of the layer [m].
         along, turn, bare, slack: see Patch.
         twist, known: see footing.aged.
+        taken: way by which what other tools drag takes the skin along in the step, (3,) [m].
         pressed: whether the tool pressed before the step.
         before_contact, before_elastic, before_slid, before_held: see Memory and Scalars, before the step.
         first: Scalars.limit before the step [N].
@@ -414,6 +417,9 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
         turned, out = faced(springs, stiffness, contact, bend, MOST_LEAN)
         square = (springs[:, 0].sum() / stiffness[0]) ** 2 + (springs[:, 1].sum() / stiffness[1]) ** 2
     way, rolled, room = way_of_tool(twist, known, before_contact, pressed, contact, origin, depth, radius, lever, room)
+    if pressed:
+        first_taken, second_taken = along_tangents(taken, contact)
+        way[0], way[1] = way[0] - first_taken, way[1] - second_taken
     was = stiffness[0]
     last_held = before_held if before_held > 0 else was
     held_at = stiffness * (last_held / was) if was > 0 else stiffness.copy()

@@ -10,11 +10,21 @@ import numba
 import numpy as np
 
 from stmpl_core.balance import MUCH, UNSURE, settled, work_of
-from stmpl_core.footing import HELD_OFF, aged, borne, curvature_at, needed, part_of_way, patch_of, wrapped_in
+from stmpl_core.footing import (
+    HELD_OFF,
+    aged,
+    along_tangents,
+    borne,
+    curvature_at,
+    needed,
+    part_of_way,
+    patch_of,
+    wrapped_in,
+)
 from stmpl_core.green import give_at
-from stmpl_core.relaxation import depth_left, faded, let_go, shares_aside, stretch
-from stmpl_core.sideways import interpolated
-from stmpl_core.slip import MOST_GROWN, SPRINGS, rub
+from stmpl_core.relaxation import depth_left, faded, let_go, shares_aside, stretch, weights
+from stmpl_core.sideways import NEAR_WAYS, beside_at, interpolated, spread_out
+from stmpl_core.slip import MOST_CARRIED, MOST_GROWN, SPRINGS, rub
 from stmpl_core.state import FORGOTTEN, NEVER, Scalars, parts_of, trail_of
 from stmpl_core.touch import MIN_ONE_WAY_SHARE
 from stmpl_core.wake import let_age, pressed_on
@@ -24,6 +34,10 @@ PILED = 0.5  # of drag^2 / force: error of skin that piles up; 0.7 of it on a ba
 LOST = 0.5  # of what skin carries along itself: what is gone once all of it slides; 0.4 to 0.6 by slides on a forearm
 ROUND = 0.5  # of a drag and the thickness over the radius it goes around: its error on one material; 0.4 by one tube
 MOST_DRAGGED = 0.9  # way by which sticking skin is dragged along, over the thickness, up to which it was tried
+AROUND = 1.2  # thicknesses over which what a limb gives as a whole fades, by the response of a forearm and of a tube
+MOST_TAKEN = 0.9  # of its own way: how far skin takes another place along at most
+MOST_TURNS = 8  # times that tools beside each other are asked
+ALIKE, FINEST = 1e-3, 1e-8  # by how much ways may differ then, over them, and at least [m]
 STRAYED = 0.03  # of the elastic force: part of the memory from touches out of range, beyond which an answer is, too
 
 # What a contact is as a whole: wrench without friction 0 to 5, bound, in range, status (of those below), depth; sum of
@@ -42,8 +56,8 @@ OUT = 10
 # Factor on the pressures, factor of the balance, whether that is worth a flag; whether friction was felt; its wrench, 4
 # to 9; Slip.share, .offset 11 to 13, .turn, .lean 15 to 17, .grown, .slid_offset 19 to 21, .slid_turn, .middle 23 to
 # 25; way by which skin is dragged over the thickness; depth to which skin that is free has come back [m]; way of the
-# contact over the skin, over its radius (footing.aged).
-SAYS = 29
+# contact over the skin, over its radius (footing.aged); Slip.taken, 29 to 31.
+SAYS, TAKEN = 32, 29
 (PRESSING, ELASTIC, LARGEST, NET, RADIUS, DEPTH, IMPRINT_FORCE, POWER, SHARE, WORK, PASSIVE, LIMIT, STRETCH, SURFACE,
  SLID, STRAYS, HELD, ROLLED, _, _, PASSED, _, _, DOUBTED) = range(len(Scalars._fields))  # fmt: skip
 NO_PLACE, NO_FORCE = np.zeros(3), np.zeros(0)
@@ -113,14 +127,77 @@ def _gone(before, after, point):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _aged(parts, told, pose, part, shares, times, fades, dt, middle):
+def _along(parts, wrench, shares, times, fades, dt):
+    """Way that skin goes along with its tool in a step, by its two tangents, where a wrench (6,) tells the friction at
+    the end of it, (2,) [m]: none once all of it slides.
+    """
+    _, _, old, _, contact, _, stiffness, springs, springs_relaxed = parts
+    out, terms, wanted = np.zeros(2), len(times), along_tangents(wrench, contact)
+    if not stiffness[0] > 0 or wanted[0] ** 2 + wanted[1] ** 2 > (MOST_CARRIED * old[LIMIT]) ** 2:
+        return out
+    aside, kept, gain = shares_aside(fades, old[RADIUS], terms), np.empty(terms), np.empty(terms)
+    for x in range(2):
+        drawn, left, over = np.sum(springs[:, x]), 0.0, 1.0
+        weights(times, dt, 0.0, drawn, np.sum(springs_relaxed[:, :, x], axis=1), kept, gain)
+        for i in range(terms):
+            left, over = left + aside[i] * kept[i], over - aside[i] * gain[i]
+        out[x] = ((wanted[x] + left) / over - drawn) / stiffness[x]
+    return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _aged(parts, told, pose, part, shares, times, fades, dt, middle, along):
     """See footing.aged: of a tool that is at a pose (4, 4) now, and held its skin for a part of the step."""
     was, _, old, relaxed, contact, imprint, stiffness, _, _ = parts
     known, held = old[PRESSING] >= 0, old[PRESSING] > 0
     goes = old[LIMIT] / stiffness[0] if stiffness[0] > 0 else 0.0
-    return aged(was if told else pose, pose, imprint if told else pose, contact, known, held, old[SHARE], goes,
+    return aged(was if told else pose, pose, imprint if told else pose, contact, known, held, old[SHARE], goes, along,
                 old[RADIUS], old[PASSED : PASSED + 3], part, shares, times, fades, dt, old[ELASTIC], relaxed,
                 middle)  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _taken(rows, k, terms, thickness, give, table, modulus):
+    """Way by which what other tools drag takes the skin under one along, (3,) [m].
+
+    As far as flat skin takes it along (sideways.beside), and what a limb gives beyond that, as a whole. What each would
+    take the other along by its own force is alike, as linear skin has it (Maxwell, Betti).
+
+    Args:
+        rows: rows of Memory, (R, .).
+        k: number of the one.
+        terms: P.
+        thickness: of the layer there [m].
+        give: how it gives beyond a flat layer, (3, 3) [m/N].
+        table, modulus: see sideways.beside.
+    """
+    out, (_, _, own, _, contact, _, stiffness, _, _) = np.zeros(3), parts_of(rows[k], terms)
+    for other in range(len(rows)):
+        _, _, its, _, there, _, stiff, springs, _ = parts_of(rows[other], terms)
+        if other == k or not (stiff[0] > 0 and stiffness[0] > 0):
+            continue
+        pull, away, faces, far, on = np.zeros(3), np.zeros(3), 0.0, 0.0, 0.0
+        for x in range(3):
+            y, z = (x + 1) % 3, (x + 2) % 3
+            second = there[1, y] * there[2, z] - there[1, z] * there[2, y]
+            pull[x] = np.sum(springs[:, 0]) * there[2, x] + np.sum(springs[:, 1]) * second
+            away[x] = there[0, x] - contact[0, x]
+            faces, far = faces + there[1, x] * contact[1, x], far + away[x] ** 2
+        far = np.sqrt(far)
+        if not (faces > 0 and pull.any() and far < NEAR_WAYS[-1] * thickness):
+            continue
+        wide = np.sqrt(0.5 * (own[RADIUS] ** 2 + its[RADIUS] ** 2))
+        along, across = beside_at(table, wide, far, thickness)
+        along, across, fade = along / (modulus * thickness), across / (modulus * thickness), np.exp(
+            -far / (AROUND * thickness))  # fmt: skip
+        most = max(give[0, 0], give[1, 1], give[2, 2], 0.0) * fade + max(along, across)
+        by = faces * min(MOST_TAKEN / (np.sqrt(stiff[0] * stiffness[0]) * most), 1.0)
+        for x in range(3):
+            on += pull[x] * away[x] / max(far, 1e-12)
+        for x in range(3):
+            whole = give[x, 0] * pull[0] + give[x, 1] * pull[1] + give[x, 2] * pull[2]
+            out[x] += by * (across * pull[x] + (along - across) * on * away[x] / max(far, 1e-12) + fade * whole)
+    return out
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -139,8 +216,8 @@ def asked_for(row, pose, wrench, shares, times, fades, dt):
     slid, size, along, way = _slid(old), 0.0, 0.0, 0.0
     if not (len(times) or slid < 1):
         return 0.0, np.nan
-    unknown = np.full(3, np.nan)
-    _, _, _, _, owed, now, _ = _aged(parts, old[PRESSING] > NEVER, pose, 1.0, shares, times, fades, dt, unknown)
+    unknown, goes = np.full(3, np.nan), _along(parts, wrench, shares, times, fades, dt)
+    _, _, _, _, owed, now, _ = _aged(parts, old[PRESSING] > NEVER, pose, 1.0, shares, times, fades, dt, unknown, goes)
     for x in range(3):
         size += wrench[x] ** 2
         along += wrench[x] * contact[1, x]
@@ -153,29 +230,31 @@ def asked_for(row, pose, wrench, shares, times, fades, dt):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def asked_again(row, pose, wrench, asked, push, forces, area, thickness, depth, shares, times, fades, dt):
-    """Factor on the wrench that elastic skin was asked for, where the contact's normal turned out to be another; 0:
-    what it says fits.
+def asked_again(row, pose, wrench, asked, push, forces, points, area, thickness, depth, shares, times, fades, dt):
+    """Factor on the wrench that elastic skin was asked for, where the contact's normal or its way over the skin turned
+    out to be another; 0: what it says fits.
 
     Args:
         row, pose, wrench, shares, times, fades, dt: see `asked_for`.
         asked: wrench that the skin was asked for, (6,).
         push: force with which it answers, (3,) [N].
-        forces, area, thickness: see footing.patch_of.
+        forces, points, area, thickness: see footing.patch_of.
         depth: depth of the contact [m].
     """
     parts, terms = parts_of(row, len(times)), len(times)
-    old, size, thick, carried = parts[2], 0.0, 0.0, 0.0
+    old, size, thick, carried, middle = parts[2], 0.0, 0.0, 0.0, np.zeros(3)
     has, radius = _pressing(forces, area)
     for n in range(len(forces)):
         thick += forces[n] * thickness[n]
+        for x in range(3):
+            middle[x] += forces[n] / has * points[n, x]
     for x in range(3):
         size, carried = size + push[x] ** 2, carried + asked[x] * push[x]
     size = np.sqrt(size)
     if not size > 0:
         return 0.0
-    unknown = np.full(3, np.nan)
-    _, _, _, gain, owed, _, _ = _aged(parts, old[PRESSING] > NEVER, pose, 1.0, shares, times, fades, dt, unknown)
+    goes = _along(parts, wrench, shares, times, fades, dt)
+    _, _, _, gain, owed, _, _ = _aged(parts, old[PRESSING] > NEVER, pose, 1.0, shares, times, fades, dt, middle, goes)
     now, more = 1.0, faded(fades, radius)
     for i in range(terms):
         now -= more * shares[i] * gain[i]
@@ -240,8 +319,10 @@ def whole_of(points, area, thickness, depth, forces, corners, shares, power, alo
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def step(patches, before, after, grooves, shares, times, fades, has_skin, table, log_thickness, logs, modulus, slack,
-         dt, out, says):  # fmt: skip
+         beside, dt, out, says):  # fmt: skip
     """One step of K tools of a scene, tool by tool, then what all together have of energy; `doubted` ends it.
+
+    Tools that drag the skin beside each other are asked in turn until they agree how far each takes the others along.
 
     Args:
         patches: rows of PATCH, (K, .).
@@ -252,6 +333,7 @@ def step(patches, before, after, grooves, shares, times, fades, has_skin, table,
         shares, times, fades: series of the relaxation, (P,) each, and see relaxation.faded.
         has_skin: whether the layer has a skin of its own.
         table, log_thickness, logs, modulus, slack: see Sideways.
+        beside: see sideways.beside; read where several tools rub.
         dt: time of the step [s].
         out, says: rows of OUT and SAYS, (K, .), written.
 
@@ -261,16 +343,34 @@ def step(patches, before, after, grooves, shares, times, fades, has_skin, table,
     tools, terms = len(patches), len(times)
     stored, sure, whole = np.zeros(tools), np.zeros(tools), np.zeros(tools)
     works, givens, doubts, spares = np.zeros(tools), np.zeros(tools), np.zeros(tools), np.zeros(tools)
-    for k in range(tools):
-        _put(patches[k, :OUT], out[k])
+    for k in range(len(before)):
         _put(before[k], after[k])
-        stored[k], sure[k], whole[k], works[k], doubts[k], givens[k] = _one(
-            patches[k], before[k], after[k], grooves, shares, times, fades, has_skin, table, log_thickness, logs,
-            modulus, slack, dt, out[k], says[k])  # fmt: skip
-    for k in range(tools, len(before)):
-        _put(before[k], after[k])
-        if dt > 0:
+        if k >= tools and dt > 0:
             _left(before[k], after[k], grooves, shares, times, dt)
+    takes, was, now, turn, differ = np.zeros((tools, 3)), np.zeros((tools, 3)), np.zeros(3), 0, 1.0
+    while turn < MOST_TURNS and differ > 0:
+        differ = 0.0
+        for k in range(tools):
+            rubs = len(before) > 1 and patches[k, FRICTION] > 0 and patches[k, 16] > 0
+            if rubs and parts_of(before[k], terms)[2][PRESSING] > 0:
+                thick, give = patches[k, 16], patches[k, 21:30].copy().reshape(3, 3)
+                if turn == 0:
+                    was[k] = _taken(before, k, terms, thick, give, beside, modulus)
+                now = _taken(after, k, terms, thick, give, beside, modulus)
+            else:
+                now[:] = 0.0
+            size = off = 0.0
+            for x in range(3):
+                size, off = size + now[x] ** 2, off + (now[x] - takes[k, x]) ** 2
+            if turn == 0 or off > ALIKE**2 * size + FINEST**2:
+                differ, says[k, :] = 1.0 if rubs else differ, 0.0
+                _put(now, takes[k])
+                _put(patches[k, :OUT], out[k])
+                _put(before[k], after[k])
+                stored[k], sure[k], whole[k], works[k], doubts[k], givens[k] = _one(
+                    patches[k], before[k], after[k], grooves, shares, times, fades, has_skin, table, log_thickness,
+                    logs, modulus, slack, dt, now, now - was[k], out[k], says[k])  # fmt: skip
+        turn += 1
     for k in range(tools):
         old, new = parts_of(before[k], terms)[2], parts_of(after[k], terms)[2]
         first, work = not old[PRESSING] >= 0 or patches[k, BY_FORCE] > 0, works[k] + old[WORK]
@@ -367,8 +467,13 @@ def doubted(before, after, shares, times, dt, possible, out, says):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _one(patch, before, after, grooves, shares, times, fades, has_skin, table, log_thickness, logs, modulus, slack, dt,
-         out, says):  # fmt: skip
+         taken, takes, out, says):  # fmt: skip
     """One tool. Writes its memory and its rows.
+
+    Args:
+        taken: way by which what other tools drag takes its skin along, after the step, (3,) [m].
+        takes: the same in the step.
+        other: see `step`.
 
     Returns:
         stored, sure, whole: energy that the contact could give back, that it surely does, and that it could hold [J].
@@ -381,14 +486,18 @@ def _one(patch, before, after, grooves, shares, times, fades, has_skin, table, l
     stated_pose = _pose_at(patch, STATED_POSE) if by_force or patch[BACK] > 0 else pose
     push, size = patch[:3].copy(), np.sqrt(patch[0] ** 2 + patch[1] ** 2 + patch[2] ** 2)
     presses, depth, power = patch[8] == HOLDS and patch[10] > 0 and size > 0, patch[9], patch[18]
-    middle = np.full(3, np.nan)  # by force it was asked for without that
-    if presses and not by_force:
+    middle, goes = np.full(3, np.nan), np.full(2, np.nan)
+    if presses:
         _put(patch[11:14], middle)
-    twist, gone, kept, gain, owed, _, passed = _aged(parts, told, stated_pose, 1.0, shares, times, fades, dt, middle)
+    if by_force:
+        _put(_along(parts, patch[STATED : STATED + 6], shares, times, fades, dt), goes)
+    twist, gone, kept, gain, owed, _, passed = _aged(
+        parts, told, stated_pose, 1.0, shares, times, fades, dt, middle, goes)  # fmt: skip
     if presses and old[PRESSING] == 0 and terms and not by_force:  # it came late in the step: from then on it relaxes
         way = -_gone(stated_pose, was, patch[11:14])
         part = part_of_way(way, push / size, depth, patch[20], power)
-        _, gone, kept, gain, owed, _, passed = _aged(parts, told, stated_pose, part, shares, times, fades, dt, middle)
+        _, gone, kept, gain, owed, _, passed = _aged(
+            parts, told, stated_pose, part, shares, times, fades, dt, middle, goes)  # fmt: skip
     says[28], asked = gone, 0.0
     if presses:
         slid_before = _slid(old)
@@ -409,17 +518,20 @@ def _one(patch, before, after, grooves, shares, times, fades, has_skin, table, l
             if mu > 0 and net > MIN_ONE_WAY_SHARE:
                 bend, give = patch[30:39].copy().reshape(3, 3), patch[21:30].copy().reshape(3, 3)
                 along, turn, bare = interpolated(table, log_thickness, logs, patch[14], patch[16])
-                unit = modulus * patch[14]
+                longer, apart = spread_out(patch[15] / patch[14])
+                unit = modulus * patch[14] * longer
+                turn = (turn / longer + along * apart) * patch[14] ** 2
                 (wrench, rubs, share, offset, turned, lean, grown, slid_offset, slid_turn, limit, stiff, drawn,
                  drawn_relaxed, bent, slid, held_at, room, passed, there, besides) = rub(
                     wrench, patch[STATED : STATED + 6], by_force, there, pose[:3, 3].copy(), bend, give, mu,
                     LOST * patch[19], patch[WRAPPED : WRAPPED + 9].copy().reshape(3, 3), force, patch[15], at_rest,
-                    depth, patch[14], patch[16], power, along * unit, turn * unit * patch[14] ** 2, bare * unit,
-                    slack * patch[14], twist, old[PRESSING] >= 0, held, contact, old[ELASTIC], slid_before, old[HELD],
-                    old[LIMIT], old[ROLLED : ROLLED + 3].copy(), passed, springs, springs_relaxed,
+                    depth, patch[14], patch[16], power, along * unit, turn * unit, bare * unit,
+                    slack * patch[14], twist, takes, old[PRESSING] >= 0, held, contact, old[ELASTIC], slid_before,
+                    old[HELD], old[LIMIT], old[ROLLED : ROLLED + 3].copy(), passed, springs, springs_relaxed,
                     stiffness, shares_aside(fades, patch[14], terms), times, dt)  # fmt: skip
                 changed, doubt = grown * changed, grown * doubt
                 drag = rubs[0] ** 2 + rubs[1] ** 2 + rubs[2] ** 2
+                besides += (longer - 1) * (1 - share) * np.sqrt(drag)  # stiffer one way than the other
                 pressing = np.sqrt(wrench[0] ** 2 + wrench[1] ** 2 + wrench[2] ** 2)
                 if has_skin:
                     besides += RUBBED * pressing + PILED * drag / pressing
@@ -437,6 +549,8 @@ def _one(patch, before, after, grooves, shares, times, fades, has_skin, table, l
                 _put(rubs, says[4:10])
                 for x in range(3):
                     says[11 + x], says[15 + x], says[19 + x] = offset[x], lean[x], slid_offset[x]
+                    says[TAKEN + x] = taken[x]
+                    bent += 0.5 * rubs[x] * taken[x]
                 wrench = wrench + rubs
                 stored, sure, whole = stored + bent, sure + bent, whole + 2 * bent
                 _put(stiff, news[6])

@@ -73,6 +73,7 @@ class Slip(NamedTuple):
         grown: factor on the pressure, of the same energy as the lean [-].
         slid_offset, slid_turn: part of offset and turn that moves skin as what slides does: none while all sticks, all
             in a slide, which it stays where the tool stops or turns back, (3,) [m], [rad].
+        taken: way by which what other tools drag takes the skin under this one along, beyond `offset`, (3,) [m].
     """
 
     wrench: Wrench
@@ -84,6 +85,7 @@ class Slip(NamedTuple):
     grown: float = 1.0
     slid_offset: np.ndarray = NONE
     slid_turn: float = 0.0
+    taken: np.ndarray = NONE
 
     @property
     def kind(self) -> SlipKind:

@@ -501,6 +501,44 @@ def test_a_ball_that_rolls_comes_to_fresh_skin_and_one_that_spins_without_fricti
     assert after(0.0, 1.5, 1e-3) == pytest.approx(back, rel=0.02)
 
 
+@pytest.mark.parametrize("friction", [None, "dry"])
+def test_by_wrench_a_contact_that_goes_over_the_skin_is_fresh_however_the_tool_does_and_the_way_is_cut(
+        sim: Simulator, friction: str | None) -> None:  # fmt: skip
+    """A friction of nothing is told, so skin goes along with no tool, not even with one of dry steel."""
+    rubbed = Simulator(sim.layer, Winkler(), sim.tools, friction=friction)
+
+    def after(way: float, angle: float, steps: int) -> float:
+        (touch,), state = rubbed.touch([pressed(DEPTH, (0, 0, -0.5))], State(), 0.0)
+        (touch,), state = rubbed.touch([pressed(DEPTH, (0, 0, -0.5))], state, 20.0)
+        for k in range(1, steps + 1):
+            pose = turn((0, 1, 0), angle * k / steps, (MIDDLE[0] + way * k / steps, MIDDLE[1], RADIUS - DEPTH))
+            (touch,), state = rubbed.touch([Contact(BALL, pose, np.array([0, 0, -0.5, 0, 0, 0]))], state, 1.0 / steps)
+        return touch.depth
+
+    still, slides = after(0.0, 0.0, 20), after(0.03, 0.0, 1)
+    assert still > 1.05 * slides
+    for steps in (4, 40):
+        assert after(0.03, 0.0, steps) == pytest.approx(slides, rel=0.01)
+        assert after(0.03, 0.03 / RADIUS, steps) == pytest.approx(slides, rel=0.015)
+        assert after(0.0, 1.5, steps) == pytest.approx(still, rel=0.01)
+
+
+def test_by_wrench_skin_goes_along_with_a_tool_as_far_as_its_friction_drags_it(sim: Simulator) -> None:
+    """A ball that pulls at its skin, and goes as far as that gives, stays on the skin that has relaxed."""
+    rubbed, way, depths = Simulator(sim.layer, Winkler(), sim.tools, friction=1.0), 0.0, []
+    for pull in (0.0, 0.2):
+        (touch,), state = rubbed.touch([pressed(DEPTH, (0, 0, -0.5))], State(), 0.0)
+        (touch,), state = rubbed.touch([pressed(DEPTH, (0, 0, -0.5))], state, 20.0)
+        for k in range(1, 21):
+            wrench = np.array([pull * k / 20, 0, -0.5, 0, -pull * k / 20 * (RADIUS - DEPTH), 0])
+            (touch,), state = rubbed.touch([Contact(BALL, at(MIDDLE[0] + way, MIDDLE[1], RADIUS - DEPTH), wrench)],
+                                           state, 0.05)  # fmt: skip
+            assert touch.slip is not None
+            way = float(touch.slip.offset[0])
+        depths.append(touch.depth)
+    assert way > 2e-4 and depths[1] == pytest.approx(depths[0], rel=0.01)
+
+
 def test_a_state_that_is_none_or_not_finite_is_refused(sim: Simulator) -> None:
     _, state = sim.touch([pressed(DEPTH)], State(), 0.1)
     memory = state.tools[BALL.name]

@@ -19,9 +19,9 @@ from stmpl_core.batch import numbers_of
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction, coefficients
 from stmpl_core.green import Green
-from stmpl_core.history import has_other_shape, is_of_other, number_of, shape_of
+from stmpl_core.history import ALONE, has_other_shape, is_of_other, number_of, shape_of
 from stmpl_core.relaxation import RADII, fading, series_of
-from stmpl_core.sideways import Sideways, fading_aside
+from stmpl_core.sideways import Sideways, beside, fading_aside
 from stmpl_core.skin import Skin
 from stmpl_core.state import FORGOTTEN, NEVER, Memory, State, fresh, size_of
 from stmpl_core.stepped import FRICTION, HOLDS, NUMBER, OUT, SAYS, doubted, step
@@ -121,6 +121,9 @@ class Steps:
         self._skins = np.array([float(skin.layer.tissue.skin is not None) for skin in skins])
         self.gives, self.bends = _along_skin(skins) if rubs else (np.empty((0, 3, 3)), np.empty((0, 3, 3)))
         aside = [Sideways(skin.layer.typical) for skin in skins] if rubs else []
+        near = rubs and len(tools) > 1
+        self._beside = np.array([beside(skin.layer.typical.tissue, t) if near else ALONE
+                                 for skin, t in zip(skins, middle, strict=True)])  # fmt: skip
         wide = max((len(one._table) for one in aside), default=1)
         self._tables = np.zeros((len(skins), wide, len(aside[0]._logs) if rubs else 1, 3))
         self._logs, self._sizes = np.zeros((len(skins), wide + self._tables.shape[2])), np.zeros((len(skins), 3))
@@ -187,7 +190,7 @@ class Steps:
                                "those of this batch's at_rest().")  # fmt: skip
         out, after, missed = patches[:, :, :OUT].copy(), before.copy(), states.missed.copy()
         what = (patches, before, after, missed, self._of, self._terms, *self._series, self._mu, self._numbers,
-                self._skins, self._tables, self._logs, self._sizes, dt, out)  # fmt: skip
+                self._skins, self._tables, self._logs, self._sizes, self._beside, dt, out)  # fmt: skip
         n, part = len(patches), max(FEW, -(-len(patches) // self._threads))
         if n > part:
             list(self._pool.map(lambda at: _step_some(at, min(at + part, n), *what), range(0, n, part)))
@@ -210,7 +213,7 @@ def _along_skin(skins: Sequence[Skin]) -> tuple[np.ndarray, np.ndarray]:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _step_some(first, end, patches, before, after, missed, of, terms, shares, times, fades, mu, numbers, skins, tables,
-               logs, sizes, dt, out):  # fmt: skip
+               logs, sizes, beside, dt, out):  # fmt: skip
     """See Steps.step: some of the scenes. Writes what is `missed` after it, see WarpStates, over that before."""
     says = np.zeros((patches.shape[1], SAYS))
     for s in range(first, end):
@@ -223,8 +226,8 @@ def _step_some(first, end, patches, before, after, missed, of, terms, shares, ti
             for k in range(patches.shape[1]):
                 patches[s, k, FRICTION], patches[s, k, NUMBER] = mu[k], numbers[k]
             step(patches[s], before[s], after[s], False, shares[i, :p], times[i, :p], fades[i], skins[i] > 0,
-                 tables[i, :many], logs[i, :many], logs[i, wide:], sizes[i, 0], sizes[i, 1], dt, out[s],
-                 says)  # fmt: skip
+                 tables[i, :many], logs[i, :many], logs[i, wide:], sizes[i, 0], sizes[i, 1], beside[i], dt,
+                 out[s], says)  # fmt: skip
             if p:
                 doubted(before[s], after[s], shares[i, :p], times[i, :p], dt, out[s, :, 6].copy(), out[s], says)
             if _still_missed(missed[s], out[s], mu, shares[i, :p], times[i, :p], dt):
