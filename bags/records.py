@@ -111,7 +111,8 @@ def bag_file(path: Path | str) -> Path:
     found = sorted(file for file in path.iterdir() if file.suffix == ".mcap") if path.is_dir() else []
     if len(found) != 1:
         names = ", ".join(f.name for f in found) or "none"
-        raise BagError(f"{path} is no recording: expected one .mcap file, found {names}.")
+        split = " Of a recording that was split, give them one by one, or join them (mcap merge)." if found else ""
+        raise BagError(f"{path} is no recording: expected one .mcap file, found {names}.{split}")
     return found[0]
 
 

@@ -15,7 +15,7 @@ from bags.reader import DISPLACEMENT, TYPES, Bag, ends, fields_of, tool_kind
 from bags.records import Place
 from bags.wire import contact_from, frame_from, stamp_ns
 from stmpl_core.contact import Contact
-from stmpl_core.errors import BagError, FrameError
+from stmpl_core.errors import BagError, FrameError, InvalidInput
 
 NANO = 1e-9  # seconds in a nanosecond
 LATE = 500_000_000  # time after an answer until which a recorder may receive what it answers [ns]
@@ -95,6 +95,8 @@ class Run(Bag):
             raise BagError(f"an answer to tool {tool} at {posed * NANO:.3f} s cannot be repeated offline: {error}. A "
                            "recording carries what came on /tf while stmpl record ran, and the table of its --frames; "
                            "stmpl replay --publish sends the poses to a node.") from error  # fmt: skip
+        except InvalidInput as error:  # a message that no node would take
+            raise BagError(f"an answer to tool {tool} at {posed * NANO:.3f} s cannot be repeated: {error}") from error
 
     @cached_property
     def moving(self) -> MovingFrames:

@@ -164,13 +164,17 @@ class History:
         self._last, self._told_last = State(memories, here, self._skin, self._tissue), touches
         return touches, self._last
 
-    def left_out(self, touches: Sequence[Touch]) -> list[str]:
-        """Tools whose skin is not back yet and that were not among the contacts, if the last step returned these."""
-        if self._last is None or not len(self.series.times) or len(touches) != len(self._told_last) \
-                or any(one is not told for one, told in zip(touches, self._told_last, strict=True)):
+    def left_out(self, touches: Sequence[Touch], state: State | None = None) -> list[str]:
+        """Tools whose skin is not back yet and that were not among the contacts, by the state that came with the
+        touches; None: by that of the last step, if it returned these.
+        """
+        if state is None and len(touches) == len(self._told_last) and \
+                all(one is told for one, told in zip(touches, self._told_last, strict=True)):
+            state = self._last
+        if state is None or not len(self.series.times):
             return []
         names = {touch.name for touch in touches}
-        return [name for name, memory in self._last.tools.items() if name not in names and memory.sunk]
+        return [name for name, memory in state.tools.items() if name not in names and memory.sunk]
 
     def _check(self, state: State) -> None:
         """Refuses a state of another skin; see `step`."""

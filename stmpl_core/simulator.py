@@ -168,8 +168,13 @@ class Simulator:
             return self.toucher.touch_all(contacts)
         return self.history.step(contacts, carried(state, self.skin, self.skin), dt)
 
-    def answer(self, touches: Sequence[Touch]) -> Answer:
+    def answer(self, touches: Sequence[Touch], state: State | None = None) -> Answer:
         """Finds the displacement of the skin under touches of this simulator, made where its joints are now.
+
+        Args:
+            touches: touches of one instant.
+            state: memory that came with them, where another simulator of this skin found them: by it skin is told of
+                that a tool left sunk which is not among them. None: that of the last `touch`, if it found these.
 
         Raises:
             InvalidInput: touches of another skin, or made where its joints were elsewhere.
@@ -185,7 +190,7 @@ class Simulator:
                                f"{', '.join(touch.name for touch in touches)}.")  # fmt: skip
         for touch in touches:
             self._check(touch)
-        left_out = self.history.left_out(touches)
+        left_out = self.history.left_out(touches, state)
         pressure = sum(pressing[1:], pressing[0]) if pressing else np.zeros(len(self.layer.vertices))
         moves = self.history.elastic(touches)
 

@@ -29,6 +29,7 @@ from stmpl_sim.protocol import Exerted, Memory, Poses, Reaction, Row, SoftContac
 
 MOST_NAMES = 30  # names of a model that an error lists
 KNOWN = 10_000  # rows of xfrc_applied that are known again
+RECENT = 64  # steps of a skin whose memory is known again by these
 SAME = 1e-9  # difference of sums of wrenches, over the largest number, that is rounding
 NO_RK4 = ("the model's integrator is RK4, to which forces that are held over a step add energy. Choose implicitfast, "
           "implicit or Euler.")  # fmt: skip
@@ -39,6 +40,17 @@ class _Source(NamedTuple):
 
     body: int
     geom: int | None
+
+
+class _Kept(NamedTuple):
+    """What a skin remembers of one MjData: memory after its last `apply` and the time of that [s], None: none yet;
+    those that it came from, from which one more at that time goes; and the rows of xfrc_applied then, as bytes."""
+
+    memory: Memory
+    time: float | None
+    before: Memory
+    since: float | None
+    rows: bytes = b""
 
 
 class SoftBody:
@@ -76,9 +88,9 @@ class SoftBody:
     Attributes:
         contact: the SoftContact.
         reaction: last reaction, with the wrenches in world axes; None before the first `apply`.
-        memory: memory of the steps; may be set. It goes with a state of `data`, also into another process: read it when
-            the state is read, and set it when the state is put back, or a skin may take its wrench in that state for
-            somebody's push.
+        memory: memory of the steps of the `data` that were applied to last; may be set, for the next ones. It goes with
+            a state of `data`, also into another process: read it when the state is read, and set it when the state is
+            put back, or a skin may take its wrench in that state for somebody's push.
 
     Raises:
         InvalidInput: names that the model does not have, kinds of geoms that cannot be tools, a tool that is part of
@@ -128,6 +140,7 @@ class SoftBody:
                     raise InvalidInput(f"tool '{name}' is a geom of tool '{whole}': it would press twice. Name one of "
                                        "them.")  # fmt: skip
         made = [_tool(model, name, self._sources[name], geoms[name]) for name in tools]
+        self._geoms = {name: (np.array(some), _shape(model, self._sources[name], some)) for name, some in geoms.items()}
         self.contact = SoftContact(layer, made, method, pose_body_from_layer=pose_body_from_layer, damping=damping,
                                    implicit=implicit, friction=friction, every=every)  # fmt: skip
         if self._jointed is not None:
@@ -135,6 +148,8 @@ class SoftBody:
         self._key = uuid4().hex
         _LIVE[self._key] = self
         self._felt = {self.body, *limbs, *(source.body for source in self._sources.values())}
+        self._kept: WeakKeyDictionary[Any, _Kept] = WeakKeyDictionary()  # by data
+        self._recent: OrderedDict[bytes, _Kept] = OrderedDict()  # by their rows
         self._exerted_in: ReferenceType[Any] | None = None  # data of the last apply, unless a memory was put since
         self.memory = Memory()
         self.reaction: Reaction | None = None
@@ -179,24 +194,30 @@ class SoftBody:
         """Finds what touches at the positions of `data`, and exerts the wrenches during the coming step.
 
         Between mj_step1 and mj_step2, or right before mj_step. Positions, and the inertia where `implicit` needs it,
-        are made up to date with qpos first. A time that went back (mj_resetData) starts afresh.
+        are made up to date with qpos first. Each MjData of the model has a memory of its own; a copy that our wrenches
+        stand in goes on with the memory of what it was copied from. Called again at the same time it answers that
+        instant anew, from the memory before it. A time that went back (mj_resetData) starts afresh.
 
         Returns:
             Touch of each tool, by name, in layer axes.
 
         Raises:
-            InvalidInput: data of another model, positions that are not finite, or RK4, chosen since.
+            InvalidInput: data of another model, positions that are not finite, RK4, chosen since, or geoms of a tool
+                that were changed since.
         """
         self._check(data)
         if self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
             raise InvalidInput(NO_RK4)
+        for name, (some, shape) in self._geoms.items():
+            if _shape(self.model, self._sources[name], some) != shape:
+                raise InvalidInput(f"geoms of the tool '{name}' are not as they were when this skin was made. Make "
+                                   "another one, SoftBody(model, skin.simulator, ...).")  # fmt: skip
         mujoco.mj_kinematics(self.model, data)
         if self._jacobians is not None:  # what mj_jac and mj_solveM read
             for update in (mujoco.mj_comPos, mujoco.mj_tendon, mujoco.mj_makeM, mujoco.mj_factorM):
                 update(self.model, data)
-        if self._time is not None and data.time < self._time and not self._put:
-            self._memory = Memory()
-        dt = 0.0 if self._time is None else max(0.0, data.time - self._time)
+        self._memory, since = self._before(data)
+        before, dt = self._memory, 0.0 if since is None else max(0.0, data.time - since)
         asked = self._memory.asked  # not kept where joints take the skin along
         mobility = None if self._jacobians is None else lambda name, at, along: self._mobility(
             data, name, at, along, None if asked is None else asked.touches.get(name))  # fmt: skip
@@ -209,8 +230,29 @@ class SoftBody:
         self._push(data, reaction)
         self._exerted_in = ref(data)
         self._keep(data)
+        self._kept[data] = kept = _Kept(self._memory, self._time, before, since, self._rows(data))
+        if self._memory.exerted is not None and self._memory.exerted.rows:
+            self._recent[kept.rows] = kept
+            self._recent.move_to_end(kept.rows)
+            if len(self._recent) > RECENT:
+                self._recent.popitem(last=False)
         self.reaction = replace(reaction, memory=self._memory)
         return reaction.touches
+
+    def _before(self, data: Any) -> tuple[Memory, float | None]:
+        """Memory from which a step goes, and its time [s]."""
+        if self._put:
+            return self._memory, self._time
+        kept, rows = self._kept.get(data), self._rows(data)
+        if kept is None or kept.rows != rows:
+            kept = self._recent.get(rows, kept)
+        if kept is None or (kept.time is not None and data.time < kept.time):
+            return Memory(), None
+        return (kept.before, kept.since) if data.time == kept.time else (kept.memory, kept.time)
+
+    def _rows(self, data: Any) -> bytes:
+        rows: bytes = data.xfrc_applied[sorted(self._felt)].tobytes()
+        return rows
 
     def _check(self, data: Any) -> None:
         """Raises InvalidInput: no MjData, or that of another model, whose wrenches are not this skin's."""
@@ -302,6 +344,7 @@ class SoftBody:
         self._check(data)
         self._exert(data, {})
         self.memory, self.reaction = Memory(), None
+        self._put, self._kept[data] = False, _Kept(Memory(), None, Memory(), None)
 
     def _push(self, data: Any, reaction: Reaction) -> None:
         rows: dict[int, Wrench] = {}
@@ -341,6 +384,16 @@ class SoftBody:
         out = np.zeros_like(row)
         mujoco.mj_solveM(self.model, data, out, row)
         return float(out[0] @ row[0])
+
+
+def _shape(model: Any, source: _Source, geoms: Sequence[int] | np.ndarray) -> bytes:
+    """What a tool's surface is made from, but for meshes, as bytes."""
+    sizes: bytes = model.geom_size[geoms].tobytes()
+    if source.geom is not None:
+        return sizes
+    some = [model.geom_pos[geoms], model.geom_quat[geoms]]
+    bodies = [body for body in set(model.geom_bodyid[geoms].tolist()) if body != source.body]
+    return sizes + b"".join(one.tobytes() for one in (*some, model.body_pos[bodies], model.body_quat[bodies]))
 
 
 def _rig_of(layer: SoftLayer | Skin | Simulator) -> Rig | None:

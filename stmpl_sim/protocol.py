@@ -433,8 +433,8 @@ class SoftContact:
         if not (self.damping or self.implicit) or (force := touch.force) == 0:
             return 1.0, (0.0, 0.0)
         normal, centre = touch.push / force, _centre_of_pressure(touch)
-        before = memory.at.get(touch.name)
-        v = 0.0
+        before, last = memory.at.get(touch.name), memory.speed.get(touch.name)
+        v = 0.0 if last is None or dt > 0 else last[0]  # a step without time goes on as before
         if before is not None and dt > 0:  # of the tool's point that is at the centre of pressure now
             v = float(_way(before, pose, centre) @ normal) / dt
         c = self.damping * force
@@ -445,7 +445,6 @@ class SoftContact:
         turn = world_from_layer[:3, :3]
         a = mobility(touch.name, turn @ centre + world_from_layer[:3, 3], turn @ normal)
         # What accelerated it in the last step, less what the contact itself did of that.
-        last = memory.speed.get(touch.name)
         free = (v - last[0]) / dt + a * last[1] if last else 0.0
         stiff = k * dt + c
         taken = max(0.0, (force + stiff * (v + dt * free)) / (1 + stiff * dt * a))

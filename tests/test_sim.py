@@ -361,6 +361,110 @@ def test_a_copy_or_a_restored_state_keeps_no_wrench_of_ours(simulator: Simulator
     np.testing.assert_array_equal(d.xfrc_applied[1:3], [[0] * 6, [0, 2, 0, 0, 0, 0]])
 
 
+def moved_ball(limb_of: SoftLayer | Simulator, **how: Any) -> tuple[Any, SoftBody]:
+    """A model of the slab with a ball that is led, and a skin of it."""
+    m = mujoco.MjModel.from_xml_string(
+        f'<mujoco><option timestep="1e-3"/><worldbody><body name="slab">{CORE}</body><body name="hand" mocap="true" '
+        'pos="0 0 .0095"><geom name="ball" type="sphere" size=".012" contype="0" conaffinity="0"/></body></worldbody>'
+        "</mujoco>")  # fmt: skip
+    return m, SoftBody(m, limb_of, body="slab", tools=["ball"], **how)
+
+
+@pytest.mark.parametrize("how", [{"damping": 5.0}, {"friction": "dry"}, {"every": 3}], ids=str)
+def test_each_data_of_a_model_has_a_memory_of_its_own(slab: SoftLayer, simulator: Simulator, how: dict[str, Any]
+                                                      ) -> None:  # fmt: skip
+    """Two scenes in turn, a ball at rest in each: one that jumped from scene to scene would be dragged, and damped."""
+    m, skin = moved_ball(slab if "friction" in how else simulator, **how)
+    scenes = [mujoco.MjData(m) for _ in range(2)]
+    alone, found = [], []
+    for d, x in zip(scenes, (0.0, 6e-3), strict=True):
+        d.mocap_pos[0, 0] = x
+    for d in scenes:
+        d2 = copy.copy(d)
+        for _ in range(6):
+            step(m, d2, skin)
+        alone.append(d2.xfrc_applied.copy())
+        skin.reset(d2)
+    for _ in range(6):
+        for d in scenes:
+            step(m, d, skin)
+    found = [d.xfrc_applied for d in scenes]
+    np.testing.assert_array_equal(found, alone)
+    skin.reset(scenes[0])
+    assert not scenes[0].xfrc_applied.any() and scenes[1].xfrc_applied.any()
+    step(m, scenes[1], skin)
+    np.testing.assert_array_equal(scenes[1].xfrc_applied, alone[1])
+
+
+def test_a_copy_that_a_skins_wrenches_stand_in_goes_on_with_its_memory(slab: SoftLayer) -> None:
+    m, skin = moved_ball(slab, friction="dry")
+    d = mujoco.MjData(m)
+
+    def led(data: Any, way: float) -> None:
+        for _ in range(5):
+            data.mocap_pos[0, 0] += way / 5
+            step(m, data, skin)
+
+    led(d, 0.0)
+    led(d, 5e-4)
+    planned, there = copy.copy(d), mujoco.MjData(m)
+    led(there, 0.0)  # something else in between
+    led(d, 5e-4)
+    led(planned, 5e-4)
+    np.testing.assert_array_equal(planned.xfrc_applied, d.xfrc_applied)
+    mujoco.mj_copyData(there, m, d)
+    led(d, -2e-4)
+    led(there, -2e-4)
+    np.testing.assert_array_equal(there.xfrc_applied, d.xfrc_applied)
+    assert abs(d.xfrc_applied[:, 0]).max() > 0.01 * abs(d.xfrc_applied[:, 2]).max()
+
+
+@pytest.mark.parametrize("how", [{"damping": 5.0}, {"implicit": True}, {"friction": "dry"}], ids=str)
+def test_an_instant_that_is_asked_about_again_has_the_same_answer(slab: SoftLayer, simulator: Simulator,
+                                                                  how: dict[str, Any]) -> None:  # fmt: skip
+    ends = []
+    for times in (1, 2):
+        m = model()
+        skin = SoftBody(m, slab if "friction" in how else simulator, body="slab", tools=["ball"], **how)
+        d = mujoco.MjData(m)
+        d.qvel[:3] = 0.02, 0.0, -0.05
+        for _ in range(12):
+            mujoco.mj_step1(m, d)
+            for _ in range(times):
+                skin.apply(d)
+            mujoco.mj_step2(m, d)
+        ends.append(np.concatenate([d.qpos, d.xfrc_applied.ravel()]))
+    np.testing.assert_array_equal(*ends)
+
+
+def test_a_scene_that_is_reset_twice_before_a_step_drags_nothing(slab: SoftLayer) -> None:
+    m, skin = moved_ball(slab, friction="dry")
+    d = mujoco.MjData(m)
+    for x in (0.0, 6e-3):
+        mujoco.mj_resetData(m, d)
+        d.mocap_pos[0, 0] = x
+        mujoco.mj_forward(m, d)
+        touch = skin.apply(d)["ball"]
+    assert touch.slip is not None and np.abs(touch.slip.wrench[:3]).max() < 1e-9 * touch.force
+
+
+def test_geoms_that_were_changed_after_the_skin_was_made_are_told_of(simulator: Simulator) -> None:
+    m, skin = moved_ball(simulator)
+    d, size = mujoco.MjData(m), m.geom("ball").size.copy()
+    step(m, d, skin)
+    m.geom("ball").size[0] = 8e-3
+    with pytest.raises(InvalidInput, match="geoms of the tool 'ball' are not as they were"):
+        skin.apply(d)
+    small = SoftBody(m, skin.simulator, body="slab", tools=["ball"])
+    assert small.apply(d)["ball"].force < 0.5 * skin.reaction.touches["ball"].force  # type: ignore[union-attr]
+    m.geom("ball").size[:] = size
+    assert skin.apply(d)["ball"].force > 0
+    whole = SoftBody(m, simulator, body="slab", tools=["hand"])
+    m.geom("ball").pos[0] = 0.5
+    with pytest.raises(InvalidInput, match="geoms of the tool 'hand' are not as they were"):
+        whole.apply(d)
+
+
 def test_an_integrator_that_gives_energy_is_refused(simulator: Simulator) -> None:
     m = model()
     m.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4

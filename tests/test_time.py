@@ -555,13 +555,15 @@ def test_skin_that_a_tool_left_sunk_is_told_of_where_that_is_left_out_of_the_con
         _, state = sim.touch([deep], state, 0.5)
     away, after = sim.touch([apart], state, 0.05)
 
-    def told(touches: list[Touch]) -> bool:
-        return "probe was left out of the contacts" in sim.answer(touches).trust.why
+    def told(touches: list[Touch], by: Simulator = sim, state: State | None = None) -> bool:
+        return "probe was left out of the contacts" in by.answer(touches, state).trust.why
 
     assert not told(away) and sim.answer(away).displacement.any()
     for dt in (0.0, 0.05):
         none, _ = sim.touch([], state, dt)
         assert told(none) and told(list(none)) and not sim.answer(none).trust.in_range
+    other = Simulator(sim.skin, tools=sim.tools)  # as a node's, which finds fields beside the reactions
+    assert told([], other, after) and not told([], other) and not told(away, other, after)
     for _ in range(40):
         _, after = sim.touch([apart], after, 60.0)
     assert not told(sim.touch([], after, 0.05)[0]), "it is back"

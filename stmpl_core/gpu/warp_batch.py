@@ -184,8 +184,8 @@ class WarpBatch:
         Args:
             poses: pose_body_from_tool of each tool in each scene: place [m] and unit quaternion x, y, z, w, (n, K, 7),
                 or matrices, (n, K, 4, 4), float32 or float64. Arrays of Warp (of wp.transform, (n, K), too) and torch
-                on this device are not copied; those of numpy are, to a GPU. A scene with a pose that is not finite or
-                not rigid is refused, and no other.
+                on this device are not copied; those of numpy are, to a GPU. Gradients are not passed on. A scene with
+                a pose that is not finite or not rigid is refused, and no other.
             states: memory of each scene from the step before, `at_rest` at the beginning; None: elastic skin without
                 friction, as if nothing had been before. Time and friction are answered on the CPU's cores, from some
                 numbers of each contact. A scene that is refused stays as it was. One that is not served does, too, but
