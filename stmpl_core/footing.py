@@ -332,10 +332,11 @@ def faced(springs, stiffness, contact, bend, most):
 
 @numba.njit(cache=True, error_model="numpy")
 def wrapped_in(points, depth, forces, normal):
-    """Mean square of the sines by which a tool's surface turns from the push within a contact, (3, 3) [-].
+    """Mean products of the ways along the skin at which a contact's forces are from their middle, (3, 3) [m2]; and what
+    they are times to be those of the sines by which the tool's surface turns from the push there [1/m2].
 
-    Where skin has sunk by its depth along the push it is on the tool, of which a ball is fitted. That is a fifth of the
-    square of the contact's radius over the ball's, each way, and 0 for what is flat.
+    Where skin has sunk by its depth along the push it is on the tool, of which a ball is fitted. The latter are a fifth
+    of the square of the contact's radius over the ball's, each way, and 0 for what is flat.
 
     Args:
         points, depth: see Nodes.
@@ -369,7 +370,7 @@ def wrapped_in(points, depth, forces, normal):
         fourth += share * square * square
     spread = fourth - square_mean * square_mean
     bend = 2 * (both - up_mean * square_mean) / spread if spread > 0 else 0.0  # |away|^2 = 2 h up + ..., on a ball
-    return bend * bend / (1 + bend * bend * square_mean) * out
+    return out, bend * bend / (1 + bend * bend * square_mean)
 
 
 @numba.njit(cache=True, error_model="numpy")

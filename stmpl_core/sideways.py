@@ -27,7 +27,8 @@ THICKNESSES = 5  # thicknesses of a stack that are tabled
 HARDER = 1e6  # factor on all of a stack, by which what has softened is never softer than tissues may be
 ASIDE_RADII = 7  # radii for which it is reckoned how much of a drag fades; others are between
 ROUNDEST = 0.78  # mean distance of a round contact's forces from its middle over its radius; a ball 0.59, a punch 0.76
-ROUND_LEVER, SPREAD, SPREAD_OVER, LONG = 0.59, 0.42, 0.45, 0.35  # see spread_out, by the linear response
+SPREAD, SPREAD_OVER, UNEVEN, UNEVEN_OVER = 0.42, 0.45, 0.25, 0.1  # see spread_out, by the linear response
+EVEN, LEAST_SHORT = 0.25, 1e-3  # mean square of ways along one axis over a^2 of an even disc; least part of a short one
 NEAR_RADII = np.geomspace(0.04, 2.5, 8)  # radii of patches beside each other that are tabled, over the thickness
 NEAR_WAYS = np.geomspace(0.04, 12.0, 24)  # distances, likewise; beyond the last one they do not feel each other
 
@@ -189,22 +190,40 @@ def beside_at(table, radius, way, thickness):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def spread_out(lever):
-    """How much stiffer a contact is along the skin than a round one as large, in the mean over directions; and by what
-    times k_t a^2 it resists a turn beyond that.
+def spread_out(lever, spread, contact, radius):
+    """How much stiffer a contact is along the skin than a round one as large, in the mean over directions; how much
+    stiffer across its long axis than along it; that axis, (3,); and by what times the k_t a^2 of a round one it resists
+    a turn beyond that.
 
-    Forces far from their middle, of a bar, a ring or a tool that touches at several places, meet fresh skin: by the
-    linear response of one material and of a stack both are within 14 % in the mean for seven such tools (a pair of
-    balls, three, bars of 4 : 1 to 12 : 1, a capsule, a ring), 40 % at most.
+    Forces far from their middle, of a bar, a ring or a tool that touches at several places, meet fresh skin. Found by
+    the linear response of one material and of a stack under pairs and threes of balls, bars of 2 : 1 to 12 : 1,
+    capsules and rings.
 
     Args:
-        lever: mean distance of the forces from the middle over the radius of a circle as large [-].
+        lever: mean distance of the forces from the middle [m].
+        spread: mean products of their ways from it, see footing.wrapped_in, (3, 3) [m2].
+        contact: see Memory.
+        radius: radius of a circle as large [m].
     """
-    beyond = max(lever - ROUNDEST, 0.0)
-    longer = 1 + SPREAD * -np.expm1(-beyond / SPREAD_OVER)
-    part = min(beyond / (1 - ROUNDEST), 1.0)
-    square = part * part * (3 - 2 * part) * (lever * lever - ROUND_LEVER * ROUND_LEVER)
-    return longer, square * (1 + LONG * np.exp(min(1 - lever, 0.0)))
+    first, second = contact[2], np.empty(3)
+    a = b = c = 0.0
+    for x in range(3):
+        y, z = (x + 1) % 3, (x + 2) % 3
+        second[x] = contact[1, y] * first[z] - contact[1, z] * first[y]
+    for x in range(3):
+        for y in range(3):
+            a, b = a + first[x] * spread[x, y] * first[y], b + first[x] * spread[x, y] * second[y]
+            c += second[x] * spread[x, y] * second[y]
+    part, longer, uneven, square = lever / radius - ROUNDEST, 1.0, 1.0, 0.0
+    angle, half = 0.5 * np.arctan2(2 * b, a - c), np.hypot(0.5 * (a - c), b)
+    long, short = 0.5 * (a + c) + half, max(0.5 * (a + c) - half, LEAST_SHORT * (a + c))
+    if part > 0:
+        longer += SPREAD * -np.expm1(-part / SPREAD_OVER)
+        part = min(part / UNEVEN_OVER, 1.0)
+        uneven = (long / short) ** (part * UNEVEN * max(1 - lever * lever / (long + short), 0.0))
+        for one, stiff in ((long, np.sqrt(uneven)), (short, 1 / np.sqrt(uneven))):
+            square += part * longer * stiff * max(one / (radius * radius) - EVEN, 0.0)
+    return longer, uneven, np.cos(angle) * first + np.sin(angle) * second, square
 
 
 class Sideways:

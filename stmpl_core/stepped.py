@@ -32,6 +32,7 @@ from stmpl_core.wake import let_age, pressed_on
 RUBBED = 0.1  # of the force: what skin that gives way beneath a dry tool is off, as the law was learnt from what sticks
 PILED = 0.5  # of drag^2 / force: error of skin that piles up; 0.7 of it on a back, where the elastic bound was 0.45
 LOST = 0.5  # of what skin carries along itself: what is gone once all of it slides; 0.4 to 0.6 by slides on a forearm
+UNROUND = 0.5  # of a drag by what is no circle, over how much stiffer it is than one: error of how stiff it is
 ROUND = 0.5  # of a drag and the thickness over the radius it goes around: its error on one material; 0.4 by one tube
 MOST_DRAGGED = 0.9  # way by which sticking skin is dragged along, over the thickness, up to which it was tried
 AROUND = 1.2  # thicknesses over which what a limb gives as a whole fades, by the response of a forearm and of a tube
@@ -46,10 +47,11 @@ STRAYED = 0.03  # of the elastic force: part of the memory from touches out of r
 # to 38 [1/m]; turn and place of the pose at which it presses, 39 to 50. Factor on the pressures less 1.
 # All 0 by pose: whether it is told by a wrench, and whether the law was asked for another; that wrench, 54 to 59. Turn
 # and place of the stated pose, 60 to 71, read where that is another. Coefficient of friction and number of the tool's
-# surface; way by which it is drawn back from the core [m]; how it is wrapped in skin, 75 to 83, see footing.wrapped_in.
-PATCH = 84
+# surface; way by which it is drawn back from the core [m]; how its forces are spread, 75 to 83, and how skin wraps it,
+# see footing.wrapped_in.
+PATCH = 85
 POSE, FACTOR, BY_FORCE, CREEPS, STATED, STATED_POSE, FRICTION, NUMBER, BACK = 39, 51, 52, 53, 54, 60, 72, 73, 74
-WRAPPED = 75
+SPREAD = 75
 APART, HOLDS = 1.0, 2.0  # statuses: a tool is off, or holds the skin; another one's wrench stays as it is
 # What a step makes of it: wrench, bound, in range, status and depth, as in a PATCH; and more, see SAYS.
 OUT = 10
@@ -312,7 +314,8 @@ def whole_of(points, area, thickness, depth, forces, corners, shares, power, alo
     if rubs:
         bend = curvature_at(corners, shares, forces, frames, curvature, vertex_thickness)
         _put(bend.ravel(), out[30:39])
-        _put(wrapped_in(points, depth, forces, normal).ravel(), out[WRAPPED : WRAPPED + 9])
+        spread, out[SPREAD + 9] = wrapped_in(points, depth, forces, normal)
+        _put(spread.ravel(), out[SPREAD : SPREAD + 9])
         if len(gives):
             _put((give_at(corners, shares, forces, gives, turns) / modulus).ravel(), out[21:30])
 
@@ -518,20 +521,27 @@ def _one(patch, before, after, grooves, shares, times, fades, has_skin, table, l
             if mu > 0 and net > MIN_ONE_WAY_SHARE:
                 bend, give = patch[30:39].copy().reshape(3, 3), patch[21:30].copy().reshape(3, 3)
                 along, turn, bare = interpolated(table, log_thickness, logs, patch[14], patch[16])
-                longer, apart = spread_out(patch[15] / patch[14])
-                unit = modulus * patch[14] * longer
-                turn = (turn / longer + along * apart) * patch[14] ** 2
+                spread = patch[SPREAD : SPREAD + 9].copy().reshape(3, 3)
+                longer, uneven, axis, apart = spread_out(patch[15], spread, there, patch[14])
+                unit, turn = modulus * patch[14], (turn + along * apart) * patch[14] ** 2
+                along, bare, both = along * longer, bare * longer, np.sqrt(uneven)
+                if uneven > 1:  # softer along its axis, and stiffer across
+                    for x in range(3):
+                        for y in range(3):
+                            flat = (x == y) - there[1, x] * there[1, y]
+                            more = (1 / both - 1) * flat + (both - 1 / both) * axis[x] * axis[y]
+                            give[x, y] += more / (along * unit)
                 (wrench, rubs, share, offset, turned, lean, grown, slid_offset, slid_turn, limit, stiff, drawn,
                  drawn_relaxed, bent, slid, held_at, room, passed, there, besides) = rub(
                     wrench, patch[STATED : STATED + 6], by_force, there, pose[:3, 3].copy(), bend, give, mu,
-                    LOST * patch[19], patch[WRAPPED : WRAPPED + 9].copy().reshape(3, 3), force, patch[15], at_rest,
+                    LOST * patch[19], patch[SPREAD + 9] * spread, force, patch[15], at_rest,
                     depth, patch[14], patch[16], power, along * unit, turn * unit, bare * unit,
                     slack * patch[14], twist, takes, old[PRESSING] >= 0, held, contact, old[ELASTIC], slid_before,
                     old[HELD], old[LIMIT], old[ROLLED : ROLLED + 3].copy(), passed, springs, springs_relaxed,
                     stiffness, shares_aside(fades, patch[14], terms), times, dt)  # fmt: skip
                 changed, doubt = grown * changed, grown * doubt
                 drag = rubs[0] ** 2 + rubs[1] ** 2 + rubs[2] ** 2
-                besides += (longer - 1) * (1 - share) * np.sqrt(drag)  # stiffer one way than the other
+                besides += UNROUND * (longer - 1) * (1 - share) * np.sqrt(drag)
                 pressing = np.sqrt(wrench[0] ** 2 + wrench[1] ** 2 + wrench[2] ** 2)
                 if has_skin:
                     besides += RUBBED * pressing + PILED * drag / pressing

@@ -228,7 +228,8 @@ def _rubbed(toucher: Toucher, sideways: Sideways, one: Contact) -> _Rubbed | Non
     stiffer, _ = ploughing(touch.depth, radius, pressing, patch.along, patch.bare, 0.0)
     rises = touch.depth / radius * pressing / (patch.along * radius)
     alone = stiffness = stiffer * patch.secant(rubs)
-    leans, gives, wrap = 0.0, 0.0, wrapped_in(nodes.points, nodes.depths, pressed.forces, normal)
+    spread, sines = wrapped_in(nodes.points, nodes.depths, pressed.forces, normal)
+    leans, gives, wrap = 0.0, 0.0, sines * spread
     turns = float(along @ wrap @ along) / rubs**2 if rubs > 0 else 0.5 * float(np.trace(wrap))
     if rubs > 0:
         gives = max(float(along @ give @ along) / rubs**2, 0.0)

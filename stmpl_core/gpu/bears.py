@@ -25,7 +25,7 @@ def _sunk(scratch: Scratch, s: wp.int32, i: wp.int32, stacked: wp.int32) -> real
 
 @wp.func
 def _wrapped_in(scratch: Scratch, s: wp.int32, k: wp.int32, stacked: wp.int32, middle: vec3, normal: vec3,
-                total: real) -> mat33:  # fmt: skip
+                total: real) -> tuple[mat33, real]:  # fmt: skip
     """footing.wrapped_in of a tool's nodes in a scene."""
     deep, up_mean, square_mean, both, fourth = real(0.0), real(0.0), real(0.0), real(0.0), real(0.0)
     out = mat33()
@@ -47,10 +47,10 @@ def _wrapped_in(scratch: Scratch, s: wp.int32, k: wp.int32, stacked: wp.int32, m
             both += share * up * square
             fourth += share * square * square
     spread = fourth - square_mean * square_mean
-    if spread <= real(0.0):
-        return mat33()
-    bend = real(2.0) * (both - up_mean * square_mean) / spread
-    return bend * bend / (real(1.0) + bend * bend * square_mean) * out
+    bend = real(0.0)
+    if spread > real(0.0):
+        bend = real(2.0) * (both - up_mean * square_mean) / spread
+    return out, bend * bend / (real(1.0) + bend * bend * square_mean)
 
 
 @wp.kernel
@@ -118,10 +118,11 @@ def bear(first: wp.int32, many: wp.int32, gives: wp.array(dtype=mat33), bends: w
                     give = give + share * gives[trio[x]]
                     bend = bend + share * bends[trio[x]]
     if gives.shape[0] > 0:
-        wrap = _wrapped_in(scratch, s, k, one.stacked, middle, normal, wp.max(total, NONE))
+        spread, sines = _wrapped_in(scratch, s, k, one.stacked, middle, normal, wp.max(total, NONE))
+        out[n, k, 84] = sines
         for x in range(3):
             for y in range(3):
-                out[n, k, 75 + 3 * x + y] = wrap[x, y]
+                out[n, k, 75 + 3 * x + y] = spread[x, y]
     radius = wp.sqrt(size / PI)
     out[n, k, 10] = one.modulus * total
     for x in range(3):
