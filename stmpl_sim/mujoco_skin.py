@@ -29,7 +29,7 @@ from stmpl_sim.protocol import Exerted, Memory, Poses, Reaction, Row, SoftContac
 
 MOST_NAMES = 30  # names of a model that an error lists
 KNOWN = 10_000  # rows of xfrc_applied that are known again
-RECENT = 64  # steps of a skin whose memory is known again by these
+RECENT = 16  # steps of a skin whose memory is known again by these
 SAME = 1e-9  # difference of sums of wrenches, over the largest number, that is rounding
 NO_RK4 = ("the model's integrator is RK4, to which forces that are held over a step add energy. Choose implicitfast, "
           "implicit or Euler.")  # fmt: skip
