@@ -1,15 +1,47 @@
-"""Events: what the middleware tells of the input: devices that come and go, deadlines missed, messages lost."""
+"""Events: what the middleware tells of topics: devices that come and go, deadlines missed, messages lost."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
-from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
+from rclpy.event_handler import EventHandler, SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, qos_policy_name_from_kind
 from rclpy.subscription import Subscription
+from rclpy.waitable import Waitable
+
+from stmpl_ros.ticks import steady_timer
+
+LOOK_S = 0.1  # time between two looks at what happened [s]
+NEWS = ("total_count_change", "current_count_change", "alive_count_change", "not_alive_count_change")
+
+
+class PolledEvents(Node):
+    """A node that looks for the events of its topics by a timer, so that topics can be closed while it spins.
+
+    An event that waits in rclpy's EventsExecutor (7.1) while its topic is closed ends the process by a segmentation
+    fault: what the executor held for it is let go without Python's lock (github.com/ros2/rclpy/issues/1644). So it
+    hears of no event.
+    """
+
+    def __init__(self, name: str, **node_options: Any) -> None:
+        super().__init__(name, **node_options)
+        steady_timer(self, LOOK_S, self._look_for_events)
+
+    @property
+    def waitables(self) -> Iterator[Waitable]:
+        """What the executor waits for beside topics, services and timers."""
+        return (one for one in super().waitables if not isinstance(one, EventHandler))
+
+    def _look_for_events(self) -> None:
+        events = [one for one in super().waitables if isinstance(one, EventHandler)]
+        for one in reversed(events):  # who came and went is last with rclpy; who is gone misses no deadline
+            one._ready_to_take_data = True
+            event = one.take_data()
+            if any(getattr(event, name, 0) for name in NEWS):
+                one.callback(event)
 
 
 class Events:

@@ -12,13 +12,13 @@ from typing import Any
 import foxglove  # pyright: ignore[reportMissingImports]
 from foxglove.websocket import ServerListener  # pyright: ignore[reportMissingImports]
 from rclpy.experimental.events_executor import EventsExecutor
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy
 from rclpy.subscription import Subscription
 
 from bags.schema import find_schema
 from bags.wire import message_class
 from stmpl_core.errors import BagError, InvalidInput
+from stmpl_ros.events import PolledEvents
 from stmpl_ros.recorder import pattern
 from stmpl_ros.spinning import ros, spin
 from stmpl_ros.topics import as_offered
@@ -43,7 +43,7 @@ class Viewers(ServerListener):
         self.asked.put((channel.id, -1))
 
 
-class Forwarder(Node):
+class Forwarder(PolledEvents):
     """Offers each topic as a channel, and subscribes to it while somebody looks: most cost the node work only then.
 
     A further viewer of a latched topic has it subscribed anew, so that what was sent once comes again.

@@ -9,6 +9,7 @@ from typing import Any
 from lifecycle_msgs.srv import ChangeState
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
+from stmpl_ros.events import PolledEvents
 from stmpl_ros.interrupts import interrupt_in
 
 
@@ -33,7 +34,7 @@ def told[N: LifecycleNode](
     return wrapped
 
 
-class ServingNode(LifecycleNode):
+class ServingNode(PolledEvents, LifecycleNode):
     """A lifecycle node that refuses a transition which its state does not know.
 
     In rclpy 7.1 the exception of such a call of `~/change_state` leaves the executor, and ends the process.
