@@ -289,7 +289,7 @@ class Answering:
         """The answer to touches. Raises InvalidInput if it would not be finite."""
         asked.fields.toucher.tools = self.simulator.tools.copy()  # which the executor may change meanwhile
         asked.fields.move_to(asked.skin)
-        answer = asked.fields.answer(asked.reaction.touches)
+        answer = asked.fields.answer(asked.reaction.touches, asked.reaction.after)
         if asked.doubt:
             answer = replace(answer, trust=answer.trust.also(asked.doubt, in_range=False))
         if not np.isfinite(answer.displacement).all():

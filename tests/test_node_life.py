@@ -242,10 +242,10 @@ def held(composed, monkeypatch) -> Iterator[Held]:
     composed.wait(lambda: composed.node.answering._field.idle)
     held, answer = Held(threading.Event(), threading.Event()), composed.node.answering._fields.answer
 
-    def answer_later(touches):
+    def answer_later(*what):
         held.begun.set()
         held.released.wait()
-        return answer(touches)
+        return answer(*what)
 
     monkeypatch.setattr(composed.node.answering._fields, "answer", answer_later)
     yield held
@@ -293,10 +293,10 @@ def test_a_field_that_fails_is_told_and_the_reaction_and_the_next_field_are_sent
     fields, failed = composed.node.answering._fields, []
     answer = fields.answer
 
-    def spoilt_once(touches):
-        found = answer(touches)
+    def spoilt_once(*what):
+        found = answer(*what)
         if not failed:
-            failed.append(touches)
+            failed.append(what)
             return replace(found, displacement=np.nan * found.displacement)
         return found
 

@@ -90,6 +90,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Recorded]:
             return sum(len(one.touches) == 2 for one in bus.got["skin/displacement"]) > 5
 
         bus.wait(two_at_a_time, "answers to both")
+        slide(hand, np.full(60, 0.009), "without the finger")
         hand.take_away()
         bus.wait(lambda: bus.said("'probe' is taken away"), "word of it")
         bus.still()
@@ -169,6 +170,14 @@ def test_whatever_has_the_node_forget_leaves_an_empty_state(recorded: Recorded, 
     assert other.state == EMPTY and len(set(layers)) == 2
     assert not {frame.stamp_ns for frame in frames} & recorded.refused
     assert all(not frame.state and not frame.touches for frame in frames if not frame.inputs), "rest needs no state"
+
+
+def test_skin_that_a_silent_tool_left_sunk_is_told_of(recorded: Recorded, frames: list[Frame]) -> None:
+    told = {frame.stamp_ns: "finger was left out of the contacts" in frame.trust.why for frame in frames}
+    known = {frame.stamp_ns: "finger" in frame.touches for frame in frames}
+    alone = [stamp for stamp in told if recorded.firsts["without the finger"] <= stamp < recorded.firsts["returned"]]
+    assert sum(told[stamp] for stamp in alone) > 5
+    assert not any(told[stamp] for stamp in told if stamp not in alone or known[stamp])
 
 
 def test_friction_and_its_kind_are_in_the_messages(frames: list[Frame]) -> None:
