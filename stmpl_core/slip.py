@@ -59,6 +59,7 @@ PART, PARTS = 0.25, 16  # way over cap / k from which a step is cut, for a slide
 SPUN = 0.8  # of slide times spin over their limit: force aside that a turning tool takes; 0.64 by finite elements
 PLOUGHED = 0.33, 0.2, 0.67  # see ploughing: growth of stiffness, and of the cap without and over mu
 FOLDS = 2.0  # what skin ahead gives as it folds, over what its lost pressure does: its shear goes, too
+FOLDINGS = 4  # trials of how far skin folds
 FURTHER = 1.05  # way of skin that slides over that of a patch that moves as one, see further
 SHEARED = 0.25  # of k u^2 of what is below skin, over its thickness: growth of the push; 1/2 between plates
 LOOSE = 0.4  # of W, see wrapped: what taut skin loses of the force once all of it slides, by flat stacks
@@ -164,6 +165,41 @@ def sheared(bare, thickness, depth, force):
         force: normal force [N].
     """
     return SHEARED * bare / (max(thickness - depth, LEAST_LEFT * thickness) * force)
+
+
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def _folded(stiffness, along, fold):
+    """Stiffness of a patch [N/m] that skin ahead of it keeps a share of, as it folds; along: k_t on a flat layer."""
+    return 1 / (1 / stiffness + (1 / fold - 1) / along)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _folding(way, before, stiffness, along, bare, slack, stiffer, most):
+    """Way (3,) [m] along which springs without folds would come to what those of skin that folds do along `way`.
+
+    What sticks is as stiff as the drag that there is lets it be (Patch.secant), not as one that slides. The way of the
+    skin decides, wherever it came from, so that folds give no energy and take none.
+
+    Args:
+        way: way of the tool along the skin and rho times its turn, (3,) [m].
+        before: forces of the springs, (3,) [N].
+        stiffness: of the patch without folds, (3,) [N/m].
+        along, bare, slack: see Patch.
+        stiffer: factor of ploughing on it [-].
+        most: drag at which all of it slides [N].
+    """
+    force = min(np.hypot(before[0], before[1]), most)
+    fold, goes, out = secant(along, bare, slack, force) / along, np.zeros(2), way.copy()
+    for x in range(2):
+        goes[x] = before[x] / _folded(stiffness[x], stiffer * along, fold) + way[x]
+    ends = np.zeros(2)
+    for _ in range(FOLDINGS):
+        for x in range(2):
+            ends[x] = goes[x] * _folded(stiffness[x], stiffer * along, fold)
+        fold = secant(along, bare, slack, min(np.hypot(ends[0], ends[1]), most)) / along
+    for x in range(2):
+        out[x] = (goes[x] * _folded(stiffness[x], stiffer * along, fold) - before[x]) / stiffness[x]
+    return out
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -412,10 +448,13 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
     """
     wanted, turned, out, carries, slid = np.zeros(3), np.zeros(3), 0.0, 1.0, before_slid
     contact, springs, relaxed, room, passed, gives = along_give(contact, give, springs, relaxed, room, passed)
-    square = 0.0
+    square, before = 0.0, np.array([springs[:, x].sum() for x in range(3)])
     if stiffness[0] > 0:
-        turned, out = faced(springs, stiffness, contact, bend, MOST_LEAN)
-        square = (springs[:, 0].sum() / stiffness[0]) ** 2 + (springs[:, 1].sum() / stiffness[1]) ** 2
+        fold = secant(along, bare, slack, min(np.hypot(before[0], before[1]), mu * force)) / along
+        seen = stiffness.copy()
+        seen[0], seen[1] = _folded(seen[0], along, fold), _folded(seen[1], along, fold)
+        turned, out = faced(springs, seen, contact, bend, MOST_LEAN)
+        square = (before[0] / seen[0]) ** 2 + (before[1] / seen[1]) ** 2
     way, rolled, room = way_of_tool(twist, known, before_contact, pressed, contact, origin, depth, radius, lever, room)
     if pressed:
         first_taken, second_taken = along_tangents(taken, contact)
@@ -425,7 +464,6 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
     held_at = stiffness * (last_held / was) if was > 0 else stiffness.copy()
     size = np.sqrt(wrench[0] ** 2 + wrench[1] ** 2 + wrench[2] ** 2)
     lost = (1 - before_slid) * before_elastic / elastic
-    before = np.array([springs[:, x].sum() for x in range(3)])
     taut, past = 1 - bare / along, 0.0
     loose = taut * LOOSE * 0.5 * (wrap[0, 0] + wrap[1, 1] + wrap[2, 2])
     shears = taut * sheared(bare, thickness, depth, force)
@@ -436,6 +474,7 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
     arm, wants, grown, cap, share, stored = contact[0] - origin, 1.0, 1.0, 0.0, 0.0, 0.0
     turned_by, arm_of_turn = way[2] / lever, lever
     carried, after, new, kept = np.zeros(3), stiffness.copy(), springs.copy(), relaxed.copy()
+    seen, fold = stiffness.copy(), 1.0
     for _ in range(MOST_PASSES):
         if by_force:
             carries = carried_more(stated, contact[1], turned) * before_slid
@@ -460,27 +499,33 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
             leans = taut * turns_along * further(along, alone, sticks, stiffer)
             ratio, past = wrapped(mu, leans, taut * turns_across)
             cap = (1 - loose) * (ratio * grown * force + (1 - taut) * (cap - most))
-        after = np.array([softened(alone, gives[0]), softened(alone, gives[1]), stiffer * turn / arm_of_turn**2])
+        flat, go = stiffer * along, way
+        after = np.array([softened(flat, gives[0]), softened(flat, gives[1]), stiffer * turn / arm_of_turn**2])
+        if alone < flat and not by_force:
+            go = _folding(way, before, after, along, bare, slack, stiffer, most)
         from_cap, from_stiffness = cap, after.copy()
         if pressed and was > 0:
             from_cap, from_stiffness = first, stiffness.copy()
         new, kept, carried, share, stored = drag_on(
-            springs, relaxed, shares, times, dt, rolled, after, held_at, cap, way, wanted, by_force, from_stiffness,
+            springs, relaxed, shares, times, dt, rolled, after, held_at, cap, go, wanted, by_force, from_stiffness,
             from_cap)  # fmt: skip
         last, last_slid = turned, slid
-        turned, out = faced(new, after, contact, bend, MOST_LEAN)
-        square = (new[:, 0].sum() / after[0]) ** 2 + (new[:, 1].sum() / after[1]) ** 2
+        first_drawn, second_drawn = new[:, 0].sum(), new[:, 1].sum()
+        fold = secant(along, bare, slack, min(np.hypot(first_drawn, second_drawn), most)) / along
+        seen[0], seen[1], seen[2] = _folded(after[0], flat, fold), _folded(after[1], flat, fold), after[2]
+        turned, out = faced(new, seen, contact, bend, MOST_LEAN)
+        square = (first_drawn / seen[0]) ** 2 + (second_drawn / seen[1]) ** 2
         slid = 1 - max(along_itself * min(np.sqrt(np.sum(carried**2)) / cap, 1.0), min(lost, along_itself))
         if np.abs(turned - last).max() + abs(slid - last_slid) < SETTLED:
             break
     if by_force:
         grown = wants = carries / slid
-    rubs, offset, turns = in_space(carried, new, after, leaned(contact, turned), contact, origin, arm_of_turn)
+    rubs, offset, turns = in_space(carried, new, seen, leaned(contact, turned), contact, origin, arm_of_turn)
     part = np.zeros(3)
     for j in range(len(new)):
         part += SLID[j] * new[j]
-    slid_offset, slid_turn = way_of_skin(part, after, contact, arm_of_turn)
-    stored += max(0.5 * (1 + grown * slid) * size * out, 0.0)
+    slid_offset, slid_turn = way_of_skin(part, seen, contact, arm_of_turn)
+    stored = stored / fold + max(0.5 * (1 + grown * slid) * size * out, 0.0)
     lean = grown * slid * size * turned
     held, total = min(after[0], last_held) if last_held > 0 else 0.0, 0.0
     for x in range(3):
