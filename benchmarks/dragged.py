@@ -1,6 +1,6 @@
 """Tools of many shapes that are dragged or turned while they press, beside finite elements on flat layers.
 
-    .venv/bin/python -m benchmarks.dragged              # all, some five minutes on one core
+    .venv/bin/python -m benchmarks.dragged              # all, some ten minutes on one core
     .venv/bin/python -m benchmarks.dragged ring pair    # those whose names begin so
 
 Each tool is pressed in straight, led by 3 mm and back (or turned by 0.15 rad and back, or slid by 12 mm), and asked at
@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import trimesh
@@ -89,6 +90,7 @@ def pair(radius: float, apart: float) -> Tool:
                 np.concatenate([both[0].faces, both[1].faces + len(both[0].vertices)]))  # fmt: skip
 
 
+@cache
 def layer(ground: str) -> tuple[SoftLayer, int]:
     """A flat layer that is wide enough for its skin, and the elements over its thickness."""
     if ground == "back":  # skin, fat and muscle as measured there
@@ -135,12 +137,14 @@ def main() -> None:
         for pose in poses[1 : len(truth)]:
             (touch,), state = simulator.touch([Contact(scene.tool, pose)], state, 0.1)
             ours.append(touch.wrench)
-        unit, row = 1e3 if scene.way == "turned" else 1.0, scene.row
-        most = np.abs(truth[5:, row]).max()
-        off = np.abs(np.array(ours)[5:, row] - truth[5:, row]).max() / most
+        unit, what = 1e3 if scene.way == "turned" else 1.0, scene.row
+        most = np.abs(truth[5:, what]).max()
+        off = np.abs(np.array(ours)[5:, what] - truth[5:, what]).max() / most
         stopped = "" if len(truth) == len(poses) else f", to pose {len(truth)} of {len(poses)}"
-        table.add_row(scene.name, scene.ground, f"{scene.depth:g}", f"{scene.friction:g}", scene.way + stopped,
-                      f"{unit * most:.3g}", f"{off:.0%}", f"{-truth[-1, 2]:.3f}", f"{-ours[-1][2]:.3f}")  # fmt: skip
+        row = (scene.name, scene.ground, f"{scene.depth:g}", f"{scene.friction:g}", scene.way + stopped,
+               f"{unit * most:.3g}", f"{off:.0%}", f"{-truth[-1, 2]:.3f}", f"{-ours[-1][2]:.3f}")  # fmt: skip
+        console.print(" | ".join(row))
+        table.add_row(*row)
     console.print(table)
 
 

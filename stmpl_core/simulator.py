@@ -190,6 +190,7 @@ class Simulator:
                                f"{', '.join(touch.name for touch in touches)}.")  # fmt: skip
         for touch in touches:
             self._check(touch)
+        check_kind("state", state, (State, type(None)))
         left_out = self.history.left_out(touches, state)
         pressure = sum(pressing[1:], pressing[0]) if pressing else np.zeros(len(self.layer.vertices))
         moves = self.history.elastic(touches)

@@ -37,7 +37,7 @@ ROUND = 0.5  # of a drag and the thickness over the radius it goes around: its e
 MOST_DRAGGED = 0.9  # way by which sticking skin is dragged along, over the thickness, up to which it was tried
 AROUND = 1.2  # thicknesses over which what a limb gives as a whole fades, by the response of a forearm and of a tube
 MOST_TAKEN = 0.9  # of its own way: how far skin takes another place along at most
-MOST_TURNS = 8  # times that tools beside each other are asked
+MOST_TURNS = 24  # times that tools beside each other are asked
 ALIKE, FINEST = 1e-3, 1e-8  # by how much ways may differ then, over them, and at least [m]
 STRAYED = 0.03  # of the elastic force: part of the memory from touches out of range, beyond which an answer is, too
 
@@ -159,31 +159,39 @@ def _aged(parts, told, pose, part, shares, times, fades, dt, middle, along):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _taken(rows, k, terms, thickness, give, table, modulus):
+def _taken(rows, k, terms, patches, table, modulus):
     """Way by which what other tools drag takes the skin under one along, (3,) [m].
 
     As far as flat skin takes it along (sideways.beside), and what a limb gives beyond that, as a whole. What each would
-    take the other along by its own force is alike, as linear skin has it (Maxwell, Betti).
+    take the other along by its own force is alike, as linear skin has it (Maxwell, Betti): thickness and give are the
+    mean of both, and places are where the skin under them came from, which no drag moves.
 
     Args:
         rows: rows of Memory, (R, .).
         k: number of the one.
         terms: P.
-        thickness: of the layer there [m].
-        give: how it gives beyond a flat layer, (3, 3) [m/N].
+        patches: rows of PATCH, (K, .): how thick the layer is under each, and how it gives beyond a flat one; of a tool
+            that is not among them as under the one.
         table, modulus: see sideways.beside.
     """
-    out, (_, _, own, _, contact, _, stiffness, _, _) = np.zeros(3), parts_of(rows[k], terms)
+    out, (_, _, own, _, contact, _, stiffness, held, _) = np.zeros(3), parts_of(rows[k], terms)
     for other in range(len(rows)):
         _, _, its, _, there, _, stiff, springs, _ = parts_of(rows[other], terms)
         if other == k or not (stiff[0] > 0 and stiffness[0] > 0):
             continue
+        o = other if other < len(patches) and patches[other, 16] > 0 else k
+        thickness = 0.5 * (patches[k, 16] + patches[o, 16])
+        give = (0.5 * (patches[k, 21:30] + patches[o, 21:30])).reshape(3, 3)
         pull, away, faces, far, on = np.zeros(3), np.zeros(3), 0.0, 0.0, 0.0
         for x in range(3):
             y, z = (x + 1) % 3, (x + 2) % 3
-            second = there[1, y] * there[2, z] - there[1, z] * there[2, y]
-            pull[x] = np.sum(springs[:, 0]) * there[2, x] + np.sum(springs[:, 1]) * second
-            away[x] = there[0, x] - contact[0, x]
+            across = there[1, y] * there[2, z] - there[1, z] * there[2, y]
+            aside = contact[1, y] * contact[2, z] - contact[1, z] * contact[2, y]
+            first, second = np.sum(springs[:, 0]) * there[2, x], np.sum(springs[:, 1]) * across
+            pull[x] = first + second
+            came = first / stiff[0] + second / stiff[1]
+            own_came = np.sum(held[:, 0]) * contact[2, x] / stiffness[0] + np.sum(held[:, 1]) * aside / stiffness[1]
+            away[x] = there[0, x] - came - contact[0, x] + own_came
             faces, far = faces + there[1, x] * contact[1, x], far + away[x] ** 2
         far = np.sqrt(far)
         if not (faces > 0 and pull.any() and far < NEAR_WAYS[-1] * thickness):
@@ -351,20 +359,23 @@ def step(patches, before, after, grooves, shares, times, fades, has_skin, table,
         if k >= tools and dt > 0:
             _left(before[k], after[k], grooves, shares, times, dt)
     takes, was, now, turn, differ = np.zeros((tools, 3)), np.zeros((tools, 3)), np.zeros(3), 0, 1.0
+    left = np.zeros(tools)
     while turn < MOST_TURNS and differ > 0:
         differ = 0.0
         for k in range(tools):
             rubs = len(before) > 1 and patches[k, FRICTION] > 0 and patches[k, 16] > 0
-            if rubs and parts_of(before[k], terms)[2][PRESSING] > 0:
-                thick, give = patches[k, 16], patches[k, 21:30].copy().reshape(3, 3)
-                if turn == 0:
-                    was[k] = _taken(before, k, terms, thick, give, beside, modulus)
-                now = _taken(after, k, terms, thick, give, beside, modulus)
-            else:
-                now[:] = 0.0
+            pressed = rubs and parts_of(before[k], terms)[2][PRESSING] > 0
+            now[:] = 0.0
+            if pressed and turn == 0:
+                was[k] = _taken(before, k, terms, patches, beside, modulus)
+            if rubs and parts_of(after[k], terms)[2][PRESSING] > 0:
+                now = _taken(after, k, terms, patches, beside, modulus)
+                if not pressed:  # it comes to skin that has gone along
+                    was[k] = now
             size = off = 0.0
             for x in range(3):
                 size, off = size + now[x] ** 2, off + (now[x] - takes[k, x]) ** 2
+            left[k] = np.sqrt(off)
             if turn == 0 or off > ALIKE**2 * size + FINEST**2:
                 differ, says[k, :] = 1.0 if rubs else differ, 0.0
                 _put(now, takes[k])
@@ -375,6 +386,8 @@ def step(patches, before, after, grooves, shares, times, fades, has_skin, table,
                     logs, modulus, slack, dt, now, now - was[k], out[k], says[k])  # fmt: skip
         turn += 1
     for k in range(tools):
+        if turn == MOST_TURNS and differ > 0:  # they did not agree
+            out[k, 6] += left[k] * parts_of(after[k], terms)[6][0]
         old, new = parts_of(before[k], terms)[2], parts_of(after[k], terms)[2]
         first, work = not old[PRESSING] >= 0 or patches[k, BY_FORCE] > 0, works[k] + old[WORK]
         works[k] = max(work, stored[k] if first else min(stored[k], work + doubts[k]))

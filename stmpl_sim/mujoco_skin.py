@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any, NamedTuple, NoReturn
 from uuid import uuid4
 from weakref import ReferenceType, WeakKeyDictionary, WeakValueDictionary, ref
@@ -44,13 +45,18 @@ class _Source(NamedTuple):
 
 class _Kept(NamedTuple):
     """What a skin remembers of one MjData: memory after its last `apply` and the time of that [s], None: none yet;
-    those that it came from, from which one more at that time goes; and the rows of xfrc_applied then, as bytes."""
+    those that it came from, from which one more at that time goes; and the rows of xfrc_applied in which wrenches of
+    the skin stood then, by body, as bytes."""
 
     memory: Memory
     time: float | None
     before: Memory
     since: float | None
-    rows: bytes = b""
+    rows: Mapping[int, bytes] = MappingProxyType({})
+
+    def stands_in(self, data: Any) -> bool:
+        """Whether one of the rows stands in `data` as it was left: others may have set numbers in the rest."""
+        return any(data.xfrc_applied[body].tobytes() == row for body, row in self.rows.items())
 
 
 class SoftBody:
@@ -149,7 +155,7 @@ class SoftBody:
         _LIVE[self._key] = self
         self._felt = {self.body, *limbs, *(source.body for source in self._sources.values())}
         self._kept: WeakKeyDictionary[Any, _Kept] = WeakKeyDictionary()  # by data
-        self._recent: OrderedDict[bytes, _Kept] = OrderedDict()  # by their rows
+        self._recent: deque[_Kept] = deque(maxlen=RECENT)  # of all data, the newest last
         self._exerted_in: ReferenceType[Any] | None = None  # data of the last apply, unless a memory was put since
         self.memory = Memory()
         self.reaction: Reaction | None = None
@@ -230,12 +236,11 @@ class SoftBody:
         self._push(data, reaction)
         self._exerted_in = ref(data)
         self._keep(data)
-        self._kept[data] = kept = _Kept(self._memory, self._time, before, since, self._rows(data))
-        if self._memory.exerted is not None and self._memory.exerted.rows:
-            self._recent[kept.rows] = kept
-            self._recent.move_to_end(kept.rows)
-            if len(self._recent) > RECENT:
-                self._recent.popitem(last=False)
+        exerted = self._memory.exerted.rows if self._memory.exerted is not None else {}
+        rows = {body: data.xfrc_applied[body].tobytes() for body in exerted}
+        self._kept[data] = kept = _Kept(self._memory, self._time, before, since, rows)
+        if rows:
+            self._recent.append(kept)
         self.reaction = replace(reaction, memory=self._memory)
         return reaction.touches
 
@@ -243,16 +248,12 @@ class SoftBody:
         """Memory from which a step goes, and its time [s]."""
         if self._put:
             return self._memory, self._time
-        kept, rows = self._kept.get(data), self._rows(data)
-        if kept is None or kept.rows != rows:
-            kept = self._recent.get(rows, kept)
-        if kept is None or (kept.time is not None and data.time < kept.time):
+        kept, now = self._kept.get(data), data.time
+        if kept is None or (kept.time is not None and now < kept.time) or not kept.stands_in(data):
+            kept = next((one for one in reversed(self._recent) if one.time <= now and one.stands_in(data)), kept)
+        if kept is None or (kept.time is not None and now < kept.time):
             return Memory(), None
         return (kept.before, kept.since) if data.time == kept.time else (kept.memory, kept.time)
-
-    def _rows(self, data: Any) -> bytes:
-        rows: bytes = data.xfrc_applied[sorted(self._felt)].tobytes()
-        return rows
 
     def _check(self, data: Any) -> None:
         """Raises InvalidInput: no MjData, or that of another model, whose wrenches are not this skin's."""
@@ -387,13 +388,17 @@ class SoftBody:
 
 
 def _shape(model: Any, source: _Source, geoms: Sequence[int] | np.ndarray) -> bytes:
-    """What a tool's surface is made from, but for meshes, as bytes."""
-    sizes: bytes = model.geom_size[geoms].tobytes()
-    if source.geom is not None:
-        return sizes
-    some = [model.geom_pos[geoms], model.geom_quat[geoms]]
-    bodies = [body for body in set(model.geom_bodyid[geoms].tolist()) if body != source.body]
-    return sizes + b"".join(one.tobytes() for one in (*some, model.body_pos[bodies], model.body_quat[bodies]))
+    """What a tool's surface is made from, but for the vertices of meshes, as bytes."""
+    some = [model.geom_size[geoms], model.geom_type[geoms], model.geom_dataid[geoms]]
+    if source.geom is None:
+        bodies: set[int] = set()
+        for body in model.geom_bodyid[geoms].tolist():
+            while body != source.body:
+                bodies.add(body)
+                body = int(model.body_parentid[body])
+        below = sorted(bodies)
+        some += [model.geom_pos[geoms], model.geom_quat[geoms], model.body_pos[below], model.body_quat[below]]
+    return b"".join(one.tobytes() for one in some)
 
 
 def _rig_of(layer: SoftLayer | Skin | Simulator) -> Rig | None:

@@ -119,6 +119,53 @@ def test_sticking_tools_beside_each_other_give_no_energy(sim: Simulator) -> None
     assert -0.005 * most < work < 0.05 * most
 
 
+@pytest.mark.parametrize("axis", [0, 1], ids=["in line", "abreast"])
+def test_what_tools_take_along_gives_no_energy_where_skin_is_uneven(axis: int) -> None:
+    """One goes, the other goes, one back, the other back, never lifted: either way round costs alike."""
+    layer = plate(0.12, 4e-3).with_(tissue=Tissue(2e4, 0.4))
+    layer = layer.with_(thickness=np.clip(12e-3 + 0.1 * layer.vertices[:, 0], 6e-3, 18e-3))
+    simulator, corners = Simulator(layer, Winkler(), friction=STICKS), [(0, 0), (1, 0), (1, 1), (0, 1), (0, 0)]
+    works, moved = [], 0.0
+    for round_ in (corners, corners[::-1]):
+        _, state = beside_each_other(simulator, "one other", (0.0, 0.0), axis, 1)
+        before, work = None, 0.0
+        for a, b in zip(2 * round_[:-1], 2 * round_[1:], strict=True):
+            for k in range(12):
+                places = np.array([[-SPLIT / 2, 0, RADIUS - DEPTH], [SPLIT / 2, 0, RADIUS - DEPTH]])
+                places[:, axis] += WAY * (np.array(a) + (np.array(b) - a) * (k + 1) / 12)
+                touches, state = simulator.touch([Contact(tool, at(*place)) for tool, place in
+                                                  zip((ONE, OTHER), places, strict=True)], state, 0.01)  # fmt: skip
+                forces = np.array([touch.wrench[:3] for touch in touches])
+                if before is not None:
+                    done = 0.5 * np.vdot(forces + before[0], places - before[1])
+                    work, moved = work + done, moved + abs(done)
+                before = forces, places
+        works.append(work)
+    assert abs(works[0] - works[1]) < 1.5e-3 * moved and min(works) > -1e-3 * moved
+
+
+def test_a_tool_that_comes_to_skin_that_went_along_knows_it_at_once(sim: Simulator) -> None:
+    _, state = beside_each_other(sim, "one", (1.0, 0.0), 0)
+    here = [Contact(ONE, at(WAY - SPLIT / 2, 0, RADIUS - DEPTH)), Contact(OTHER, at(SPLIT / 2, 0, RADIUS - DEPTH))]
+    (_, first), state = sim.touch(here, state, 0.01)
+    (_, second), _ = sim.touch(here, state, 0.01)
+    assert first.slip is not None and second.slip is not None and first.slip.taken[0] > 0.02 * WAY
+    np.testing.assert_allclose(first.slip.taken, second.slip.taken, atol=1e-7)
+    assert np.abs(first.slip.wrench).max() < 0.02 * first.force
+
+
+def test_tools_at_one_place_do_not_ask_who_came_first(sim: Simulator) -> None:
+    found = {}
+    for order in (1, -1):
+        steps = [[Contact(tool, at(0, WAY * max(0, k - 3) / 5, RADIUS - DEPTH * min(1, (k + 1) / 4)))
+                  for tool in (ONE, OTHER)[::order]] for k in range(9)]  # fmt: skip
+        for touch in led(sim, steps)[0]:
+            assert touch.slip is not None
+            found[touch.name, order] = touch.slip.wrench[1]
+    for name in ("one", "other"):
+        assert found[name, 1] == pytest.approx(found[name, -1], rel=0.03)
+
+
 def test_a_limb_takes_skin_along_further_than_flat_skin_does() -> None:
     """A tube turns about its bone as a whole: two balls abreast around it, beside what one does in the motion."""
     simulator, n = Simulator(limb(thickness=0.02), Winkler(), friction=STICKS), 4

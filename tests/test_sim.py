@@ -419,6 +419,76 @@ def test_a_copy_that_a_skins_wrenches_stand_in_goes_on_with_its_memory(slab: Sof
     assert abs(d.xfrc_applied[:, 0]).max() > 0.01 * abs(d.xfrc_applied[:, 2]).max()
 
 
+@pytest.mark.parametrize("body", ["hand", "slab"])
+def test_a_copy_is_known_where_the_tool_stood_still_since_and_where_somebody_pushes(slab: SoftLayer, body: str) -> None:
+    m, skin = moved_ball(slab, friction="dry")
+    d, row = mujoco.MjData(m), m.body(body).id
+
+    def led(data: Any, way: float, push: float = 0.0) -> None:
+        for _ in range(5):
+            data.mocap_pos[0, 0] += way / 5
+            mujoco.mj_step1(m, data)
+            skin.apply(data)
+            if push:
+                data.xfrc_applied[row, 3] = push
+            mujoco.mj_step2(m, data)
+
+    for push in (0.0, 0.25):
+        led(d, 5e-4, push)
+        assert skin.reaction is not None
+        dragged = skin.reaction.touches["ball"].wrench[0]
+        kept = copy.copy(d)
+        led(d, 0.0, push)
+        led(d, 0.0, push)
+        for data in (copy.copy(kept), d):
+            if data is d:
+                mujoco.mj_copyData(d, m, kept)
+            led(data, 0.0, push)
+            assert skin.reaction.touches["ball"].wrench[0] == pytest.approx(dragged, rel=1e-6)
+            assert abs(dragged) > 0.05 * skin.reaction.touches["ball"].force
+        skin.reset(d)
+        d = mujoco.MjData(m)
+
+
+def test_two_skins_that_feel_one_tool_both_know_a_copy(slab: SoftLayer) -> None:
+    limbs = "".join(f'<body name="slab{k}" pos="{0.05 * k} 0 0">{CORE.replace("core", f"core{k}")}</body>'
+                    for k in (0, 1))  # fmt: skip
+    m = mujoco.MjModel.from_xml_string(
+        f'<mujoco><option timestep="1e-3"/><worldbody>{limbs}<body name="hand" mocap="true" pos="0.025 0 .0095"><geom '
+        'name="ball" type="sphere" size=".012" contype="0" conaffinity="0"/></body></worldbody></mujoco>')  # fmt: skip
+    skins = [SoftBody(m, slab, body=f"slab{k}", tools=["ball"], friction="dry") for k in (0, 1)]
+    d, found = mujoco.MjData(m), []
+    for _ in range(5):
+        d.mocap_pos[0, 0] += 1e-4
+        mujoco.mj_step1(m, d)
+        for skin in skins:
+            skin.apply(d)
+        mujoco.mj_step2(m, d)
+    for data in (d, copy.copy(d)):
+        for _ in range(3):
+            mujoco.mj_step1(m, data)
+            found.append([skin.apply(data)["ball"].wrench[0] for skin in skins])
+            mujoco.mj_step2(m, data)
+    np.testing.assert_allclose(found[:3], found[3:], rtol=1e-9)
+    assert np.abs(found).min() > 0.01
+
+
+@pytest.mark.parametrize("what", ["kind of geom", "body between"])
+def test_geoms_that_became_others_are_refused(slab: SoftLayer, what: str) -> None:
+    m = mujoco.MjModel.from_xml_string(
+        f'<mujoco><worldbody><body name="slab">{CORE}</body><body name="hand" mocap="true" pos="0 0 .0095"><body '
+        'name="mid"><body name="tip"><geom name="ball" type="sphere" size=".012" contype="0" conaffinity="0"/></body>'
+        "</body></body></worldbody></mujoco>")  # fmt: skip
+    skin, d = SoftBody(m, slab, body="slab", tools=["hand"]), mujoco.MjData(m)
+    assert skin.apply(d)["hand"].force > 0
+    if what == "body between":
+        m.body("mid").pos[2] = 0.02
+    else:
+        m.geom("ball").type = mujoco.mjtGeom.mjGEOM_BOX
+    with pytest.raises(InvalidInput, match="not as they were"):
+        skin.apply(d)
+
+
 @pytest.mark.parametrize("how", [{"damping": 5.0}, {"implicit": True}, {"friction": "dry"}], ids=str)
 def test_an_instant_that_is_asked_about_again_has_the_same_answer(slab: SoftLayer, simulator: Simulator,
                                                                   how: dict[str, Any]) -> None:  # fmt: skip
