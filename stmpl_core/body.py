@@ -281,7 +281,8 @@ class Body:
         columns = [k for k, bone in enumerate(self.bones) if re.fullmatch(pattern, bone)]
         if not columns:
             raise InvalidInput(f"unknown part {part!r}. Available: {', '.join(self.parts or self.bones)}; "
-                               f"or a bone by its name, of {len(self.bones)} in Body.bones.")
+                               f"or, of one material (--tissue single), a bone by its name, of {len(self.bones)} in "
+                               "Body.bones.")  # fmt: skip
         return self.weights[:, columns].sum(axis=1) - 0.5
 
     def _level_around(self, part: str) -> np.ndarray:

@@ -123,7 +123,8 @@ def region(name: str, tone: Tone = "relaxed") -> Region:
     name = name.removeprefix("left_").removeprefix("right_")
     name = WHOLE.get(name, name)
     if name not in REGIONS:
-        raise InvalidInput(f"there is no region '{name}'. Regions: {', '.join(REGIONS)}.")
+        raise InvalidInput(f"there is no region '{name}'. Regions: {', '.join(REGIONS)}. Other parts are "
+                           "answered as one material: --tissue single.")  # fmt: skip
     if not isinstance(tone, str) or tone not in get_args(Tone):
         raise InvalidInput(f"there is no tone '{tone}'. Tones: {', '.join(get_args(Tone))}.")
     where, tensed, numbers = REGIONS[name]

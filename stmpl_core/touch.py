@@ -144,6 +144,11 @@ class Touch:
     passive: float = 1.0
     wake: Wake | None = None
 
+    def __repr__(self) -> str:
+        depth = "" if math.isnan(self.depth) else f", {1e3 * self.depth:.4g} mm deep"
+        return (f"<Touch of {self.name!r}: {self.status}, {self.force:.4g} N (bound {self.force_bound:.2g} N){depth}, "
+                f"{'to be trusted' if self.trust.ok else self.trust.why}>")  # fmt: skip
+
     def with_(self, **changes: Any) -> Touch:
         """The touch with other values of some fields; dataclasses.replace takes ten times as long.
 

@@ -102,9 +102,9 @@ class Calibration:
         pressed = {one.name for one in (*self.strokes, *self.presses)}  # each forgets by its own measure
         if any(tool in ("", name) for name in self.pulled) and not any(tool in ("", name) for name in pressed):
             raise InvalidInput(WRONG_WAY)
-        if tool and pressed and tool not in pressed:
+        if tool and tool not in pressed:
             raise InvalidInput(f"'{tool}' has not pressed with a wrench of its own since the last ~/reset; "
-                               f"{', '.join(sorted(pressed))} has.")  # fmt: skip
+                               f"{', '.join(sorted(pressed)) or 'no tool'} has.")  # fmt: skip
         if what in ("friction", "relaxation"):
             strokes = strokes_of(tool, self.strokes)
             return workshop.friction(strokes) if what == "friction" else workshop.relaxation(_longest(strokes))
