@@ -198,7 +198,7 @@ def _checked(mesh: Tool) -> tuple[Points, np.ndarray, bool, bool]:
         raise MeshError(f"the tool is {extent:.1f} m wide; at most {MAX_EXTENT:g} m is accepted. "
                         "Is its mesh in millimetres? Scale it by 1e-3.")
     if extent < MIN_EXTENT:
-        raise MeshError(f"the tool is {extent:.2g} m wide; at least {MIN_EXTENT:g} m is needed. Is its mesh in metres?")
+        raise MeshError(f"the tool is {extent:.4g} m wide; at least {MIN_EXTENT:g} m is needed. Is its mesh in metres?")
     watertight = closed(vertices, faces)
     area = areas(vertices[faces])
     faces = faces[area > 1e-12 * area.max()].astype(np.int64)

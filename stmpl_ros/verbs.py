@@ -14,6 +14,7 @@ from stmpl_core.extras import needed
 from stmpl_core.methods import METHODS
 from stmpl_core.methods import method as method_named
 from stmpl_core.outputs import writable_file
+from stmpl_core.regions import REGIONS
 from stmpl_ros.parameters import DemoConfig, LinksConfig, NodeConfig, ProbeConfig, RecordConfig, RobotConfig
 from stmpl_ros.scene import SceneConfig
 from stmpl_ros.view.config import ViewConfig
@@ -263,6 +264,8 @@ def info(path: Annotated[Path | None, tyro.conf.Positional] = None, part: str | 
         return 0
     if part is not None:
         raise InvalidInput("Give the path of a recording or --part with a region of the body, not both.")
+    if not path.exists() and str(path).removeprefix("left_").removeprefix("right_") in REGIONS:
+        raise InvalidInput(f"there is no recording '{path}'. Is the part of the body meant? stmpl info --part {path}")
     from bags.reader import Bag
     from stmpl_ros.tables import bag_figures, bag_memory, bag_table, memory_sentence, provenance_sentence
 
